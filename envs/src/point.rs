@@ -1,0 +1,1 @@
+//! A small point-to-goal task for testing trainers.

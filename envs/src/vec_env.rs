@@ -1,0 +1,118 @@
+//! The contract between an environment and a trainer.
+
+/// One named part of an observation.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ObsGroup {
+    /// Field name, e.g. "egosensing".
+    pub name: String,
+    /// Shape of the group for one environment, e.g. [2, 32].
+    pub shape: Vec<usize>,
+}
+
+impl ObsGroup {
+    /// Number of floats in the group.
+    pub fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Whether the group holds no floats.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
+/// What an action is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ActionSpace {
+    /// A vector of that many unbounded floats.
+    Continuous(usize),
+    /// One of that many choices, given as a float holding the index.
+    Discrete(usize),
+}
+
+impl ActionSpace {
+    /// Floats per action in a step's batch.
+    pub fn width(&self) -> usize {
+        match self {
+            Self::Continuous(n) => *n,
+            Self::Discrete(_) => 1,
+        }
+    }
+}
+
+/// Shapes and names that stay fixed for the life of an environment.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct EnvSpec {
+    /// Groups in the order in which they lie in an observation row.
+    pub obs: Vec<ObsGroup>,
+    /// The action space.
+    pub action: ActionSpace,
+    /// Names of the per-step figures in [`StepResult::info`] (reward terms first).
+    pub info: Vec<String>,
+    /// Names of the per-episode figures in [`StepResult::episode`], reported when an episode ends (e.g. "success").
+    pub episode: Vec<String>,
+}
+
+impl EnvSpec {
+    /// Floats of one observation row.
+    pub fn obs_dim(&self) -> usize {
+        self.obs.iter().map(ObsGroup::len).sum()
+    }
+}
+
+/// What a batch of n environments returns from one step. Buffers are owned by the caller and reused.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StepResult {
+    /// n x obs_dim: the observation to act on next; for environments that ended, the first of the NEW episode.
+    pub obs: Vec<f32>,
+    /// n x obs_dim: the observation the step led to, before any reset (equal to `obs` where nothing ended).
+    pub final_obs: Vec<f32>,
+    /// n rewards.
+    pub reward: Vec<f32>,
+    /// n: the task itself ended here (success, failure, or a step limit that the observation shows). No bootstrapping.
+    pub terminated: Vec<bool>,
+    /// n: cut off from outside; the value of `final_obs` stands for what was missed.
+    pub truncated: Vec<bool>,
+    /// n x info.len(): figures of this step.
+    pub info: Vec<f32>,
+    /// n x episode.len(): figures of the episode that ended in this step; zero where none ended.
+    pub episode: Vec<f32>,
+}
+
+/// Why an environment refused a step.
+#[derive(Debug, thiserror::Error)]
+pub enum EnvError {
+    /// Wrong sizes, non-finite actions, foreign saved states.
+    #[error("{0}")]
+    Invalid(String),
+    /// The world underneath failed.
+    #[error(transparent)]
+    World(#[from] egogen::Error),
+}
+
+/// n environments stepped together, with same-step auto-reset.
+///
+/// Every environment has random streams of its own, so results depend on the seed and the actions only: not on n's other
+/// members' actions, not on the number of threads.
+pub trait VecEnv: Send {
+    /// Fixed shapes and names.
+    fn spec(&self) -> &EnvSpec;
+
+    /// Number of environments n.
+    fn num_envs(&self) -> usize;
+
+    /// Starts fresh episodes everywhere from `seed` and writes the first observations to `obs` (n x obs_dim).
+    fn reset(&mut self, seed: u64, obs: &mut Vec<f32>) -> Result<(), EnvError>;
+
+    /// Acts in all environments. `actions`: n x action width, all finite. Ended environments are reset at once.
+    fn step(&mut self, actions: &[f32], out: &mut StepResult) -> Result<(), EnvError>;
+
+    /// The whole state, random streams included.
+    fn save_state(&self) -> Result<Vec<u8>, EnvError>;
+
+    /// Restores what `save_state` of the same kind and size wrote; afterwards steps repeat bit for bit.
+    fn load_state(&mut self, state: &[u8]) -> Result<(), EnvError>;
+
+    /// The current observations (n x obs_dim), for resuming after `load_state`.
+    fn observe(&self, obs: &mut Vec<f32>) -> Result<(), EnvError>;
+}

@@ -1,0 +1,1 @@
+//! Rotations: axis-angle and the continuous 6-D form.

@@ -1,0 +1,29 @@
+//! Motion: clips, canonical primitives, the motion-primitive model.
+
+use crate::Result;
+
+/// Frames per second of all motion.
+pub const FPS: f32 = 40.0;
+/// Frames of a primitive.
+pub const FRAMES: usize = 20;
+/// Seed (history) frames of a primitive.
+pub const SEED: usize = 2;
+/// Predicted frames of a primitive; one environment step, 0.45 s.
+pub const FUTURE: usize = FRAMES - SEED;
+/// Latent dimensions of the paper's predictor.
+pub const LATENT: usize = 128;
+
+/// A generative motion-primitive model as the simulation sees it: flat arrays, person outermost.
+pub trait MotionModel: Send + Sync {
+    /// Dimensions of the latent.
+    fn latent_dim(&self) -> usize;
+
+    /// Future markers. `seed`: n x 2 x 201 metres in the canonical frame; `latent`: n x latent_dim; `out`: n x 18 x 201.
+    fn decode(&self, seed: &[f32], latent: &[f32], out: &mut [f32]) -> Result<()>;
+
+    /// Body parameters from markers. `markers`: m x 201; `betas`: m x 10; `out`: m x 93, in the frame of the markers.
+    fn regress(&self, markers: &[f32], betas: &[f32], out: &mut [f32]) -> Result<()>;
+
+    /// Content hash of the weights, which a policy trained on this model names.
+    fn hash(&self) -> &str;
+}

@@ -1,0 +1,1 @@
+//! The learning: collector, GAE, PPO, trainer, checkpoints, loggers; and the programs.

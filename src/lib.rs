@@ -4,6 +4,7 @@
 
 pub mod agent;
 pub mod body;
+pub mod device;
 pub mod error;
 pub mod io;
 pub mod kernels;
@@ -14,5 +15,7 @@ pub mod rng;
 pub mod scene;
 pub mod sensing;
 pub mod sim;
+
+pub use device::DeviceChoice;
 
 pub use error::{Error, Result};

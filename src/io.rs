@@ -157,7 +157,11 @@ pub enum Precision {
 }
 
 /// Packs named float tensors (name, shape, row-major data) and metadata into safetensors bytes.
-pub fn pack_tensors(tensors: &[(String, Vec<usize>, Vec<f32>)], metadata: &BTreeMap<String, String>, precision: Precision) -> Result<Vec<u8>> {
+pub fn pack_tensors(
+    tensors: &[(String, Vec<usize>, Vec<f32>)],
+    metadata: &BTreeMap<String, String>,
+    precision: Precision,
+) -> Result<Vec<u8>> {
     let raw: Vec<Vec<u8>> = tensors
         .iter()
         .map(|(_, _, data)| match precision {
@@ -168,8 +172,8 @@ pub fn pack_tensors(tensors: &[(String, Vec<usize>, Vec<f32>)], metadata: &BTree
     let dtype = if precision == Precision::Full { Dtype::F32 } else { Dtype::F16 };
     let mut views = BTreeMap::new();
     for ((name, shape, _), bytes) in tensors.iter().zip(&raw) {
-        let view = TensorView::new(dtype, shape.clone(), bytes)
-            .map_err(|e| Error::invalid(format!("tensor '{name}' of shape {shape:?}: {e}")))?;
+        let view =
+            TensorView::new(dtype, shape.clone(), bytes).map_err(|e| Error::invalid(format!("tensor '{name}' of shape {shape:?}: {e}")))?;
         views.insert(name.clone(), view);
     }
     // The header's map is written in one order only when it holds one entry, so all metadata travels as one JSON text.

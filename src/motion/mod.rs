@@ -1,5 +1,12 @@
 //! Motion: clips, canonical primitives, the motion-primitive model.
 
+mod weights;
+
+pub use weights::{
+    CONFIG_FILE, CONTINUOUS, Dense, Gru, MotionConfig, MotionWeights, Named, PREDICTOR_FILE, PredictorSizes, PredictorWeights,
+    REGRESSOR_FILE, RegressorSizes, RegressorWeights,
+};
+
 use crate::Result;
 
 /// Frames per second of all motion.

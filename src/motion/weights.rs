@@ -1,0 +1,389 @@
+//! Weights of the motion model as plain arrays, and the folder they live in.
+//!
+//! A motion-model folder holds
+//! * `motion.json`: [`MotionConfig`] - sizes, frames per second, canonical convention, hashes;
+//! * `predictor.safetensors`: the marker predictor;
+//! * `regressor.safetensors`: the body regressor.
+//!
+//! Tensors carry the names and layouts of the authors' PyTorch modules. `weight` of a dense layer is (out, in) row-major, y = W x + b.
+//! A GRU has `weight_ih` (3H, I), `weight_hh` (3H, H), `bias_ih` (3H), `bias_hh` (3H) with gates in the order r, z, n:
+//! r = s(Wr x + br + Ur h + cr), z = s(Wz x + bz + Uz h + cz), n = tanh(Wn x + bn + r * (Un h + cn)), h' = (1 - z) n + z h.
+//!
+//! | predictor | kind | in -> out | |
+//! |---|---|---|---|
+//! | `x_enc.*_l0` | GRU | frame -> hidden | seed frames, shared by encoder and decoder |
+//! | `e_rnn.*_l0` | GRU | frame -> hidden | future frames |
+//! | `e_mlp.layers.{0,1}` | dense + tanh | 2 hidden [h_x, h_y] -> wide -> hidden | |
+//! | `e_mu`, `e_logvar` | dense | hidden -> latent | |
+//! | `drnn_mlp.layers.{0,1,2}` | dense + tanh | hidden (h_x) -> wide -> hidden -> hidden | initial state of `d_rnn` |
+//! | `d_rnn.*` | GRU cell | [h_x hidden, z latent, previous frame] -> hidden | |
+//! | `d_mlp.layers.{0,1}` | dense + tanh | hidden -> wide -> hidden | |
+//! | `d_out` | dense | hidden -> frame | frame = previous frame + this |
+//!
+//! | regressor | kind | in -> out | |
+//! |---|---|---|---|
+//! | `pnet.in_fc` | dense | [markers 201, betas 10, estimate 159] -> width | no activation |
+//! | `pnet.layers.N.layers.{0,1}` | dense + relu | width -> width -> width | h = block(h) + h |
+//! | `pnet.out_fc` | dense | width -> 159 | added to the estimate, which starts at zero; `passes` times |
+//!
+//! The 159 are: translation 3, 22 rotations x 6 (rows of a (3, 2) matrix, see `body::rotation`), hands 24.
+
+use crate::body::{BETAS, BODY_JOINTS, MARKER_DIM};
+use crate::io::{Precision, Tensors, content_hash, pack_tensors, write_atomic};
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+/// Floats of a body in the regressor's continuous form: translation 3, rotations 22 x 6, hands 24.
+pub const CONTINUOUS: usize = 3 + BODY_JOINTS * 6 + 24;
+/// File names of a motion-model folder.
+pub const CONFIG_FILE: &str = "motion.json";
+pub const PREDICTOR_FILE: &str = "predictor.safetensors";
+pub const REGRESSOR_FILE: &str = "regressor.safetensors";
+
+/// Sizes of the marker predictor; the defaults are the authors'.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PredictorSizes {
+    /// Floats of a frame of markers.
+    pub frame: usize,
+    /// GRU states and the narrow layers.
+    pub hidden: usize,
+    /// The first layer of each MLP.
+    pub wide: usize,
+    /// Latent dimensions.
+    pub latent: usize,
+}
+
+impl Default for PredictorSizes {
+    fn default() -> Self {
+        Self { frame: MARKER_DIM, hidden: 256, wide: 512, latent: super::LATENT }
+    }
+}
+
+/// Sizes of the body regressor; the defaults are the authors'.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RegressorSizes {
+    /// Width of the residual network.
+    pub width: usize,
+    /// Residual blocks of two layers.
+    pub blocks: usize,
+    /// Passes, each refining the estimate of the one before.
+    pub passes: usize,
+}
+
+impl Default for RegressorSizes {
+    fn default() -> Self {
+        Self { width: 128, blocks: 10, passes: 3 }
+    }
+}
+
+impl RegressorSizes {
+    /// Floats of the network's input: markers, betas, the current estimate.
+    pub const INPUT: usize = MARKER_DIM + BETAS + CONTINUOUS;
+}
+
+/// Content of `motion.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MotionConfig {
+    /// Frames per second; 40.
+    pub fps: f32,
+    /// Frames of a primitive, seed included; 20.
+    pub frames: usize,
+    /// Where the canonical origin lies: "floor" (below the pelvis, heights absolute).
+    pub canonical: String,
+    /// Sizes of the predictor.
+    pub predictor: PredictorSizes,
+    /// Sizes of the regressor.
+    pub regressor: RegressorSizes,
+    /// Content hash of the body asset whose markers were learned.
+    pub body: String,
+}
+
+impl MotionConfig {
+    /// The paper's sizes on the body with content hash `body`.
+    pub fn new(body: impl Into<String>) -> Self {
+        Self {
+            fps: super::FPS,
+            frames: super::FRAMES,
+            canonical: "floor".into(),
+            predictor: PredictorSizes::default(),
+            regressor: RegressorSizes::default(),
+            body: body.into(),
+        }
+    }
+}
+
+/// A dense layer, y = W x + b.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Dense {
+    pub input: usize,
+    pub output: usize,
+    /// (output, input) row-major.
+    pub weight: Vec<f32>,
+    /// (output).
+    pub bias: Vec<f32>,
+}
+
+/// One GRU layer or cell; gates in the order r, z, n.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Gru {
+    pub input: usize,
+    pub hidden: usize,
+    /// (3 hidden, input) row-major.
+    pub weight_ih: Vec<f32>,
+    /// (3 hidden, hidden) row-major.
+    pub weight_hh: Vec<f32>,
+    /// (3 hidden).
+    pub bias_ih: Vec<f32>,
+    /// (3 hidden).
+    pub bias_hh: Vec<f32>,
+}
+
+/// All weights of the marker predictor.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PredictorWeights {
+    pub x_enc: Gru,
+    pub e_rnn: Gru,
+    pub e_mlp: [Dense; 2],
+    pub e_mu: Dense,
+    pub e_logvar: Dense,
+    pub drnn_mlp: [Dense; 3],
+    pub d_rnn: Gru,
+    pub d_mlp: [Dense; 2],
+    pub d_out: Dense,
+}
+
+/// All weights of the body regressor.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RegressorWeights {
+    /// Passes over the network.
+    pub passes: usize,
+    pub in_fc: Dense,
+    pub blocks: Vec<[Dense; 2]>,
+    pub out_fc: Dense,
+}
+
+/// One named tensor: name, shape, row-major data.
+pub type Named = (String, Vec<usize>, Vec<f32>);
+
+impl Dense {
+    fn read(t: &Tensors, name: &str, input: usize, output: usize) -> Result<Self> {
+        let weight = t.f32s(&format!("{name}.weight"), &[output, input])?;
+        Ok(Self { input, output, weight, bias: t.f32s(&format!("{name}.bias"), &[output])? })
+    }
+
+    fn put(&self, name: &str, out: &mut Vec<Named>) {
+        out.push((format!("{name}.weight"), vec![self.output, self.input], self.weight.clone()));
+        out.push((format!("{name}.bias"), vec![self.output], self.bias.clone()));
+    }
+}
+
+impl Gru {
+    /// `suffix` is "_l0" for torch's `GRU` and "" for its `GRUCell`.
+    fn read(t: &Tensors, name: &str, suffix: &str, input: usize, hidden: usize) -> Result<Self> {
+        let get = |part: &str, shape: &[usize]| t.f32s(&format!("{name}.{part}{suffix}"), shape);
+        Ok(Self {
+            input,
+            hidden,
+            weight_ih: get("weight_ih", &[3 * hidden, input])?,
+            weight_hh: get("weight_hh", &[3 * hidden, hidden])?,
+            bias_ih: get("bias_ih", &[3 * hidden])?,
+            bias_hh: get("bias_hh", &[3 * hidden])?,
+        })
+    }
+
+    fn put(&self, name: &str, suffix: &str, out: &mut Vec<Named>) {
+        let gates = 3 * self.hidden;
+        out.push((format!("{name}.weight_ih{suffix}"), vec![gates, self.input], self.weight_ih.clone()));
+        out.push((format!("{name}.weight_hh{suffix}"), vec![gates, self.hidden], self.weight_hh.clone()));
+        out.push((format!("{name}.bias_ih{suffix}"), vec![gates], self.bias_ih.clone()));
+        out.push((format!("{name}.bias_hh{suffix}"), vec![gates], self.bias_hh.clone()));
+    }
+}
+
+impl PredictorWeights {
+    /// Reads all tensors and checks their shapes against `s`.
+    pub fn read(t: &Tensors, s: PredictorSizes) -> Result<Self> {
+        let (f, h, w) = (s.frame, s.hidden, s.wide);
+        let dense = |name: &str, i, o| Dense::read(t, name, i, o);
+        Ok(Self {
+            x_enc: Gru::read(t, "x_enc", "_l0", f, h)?,
+            e_rnn: Gru::read(t, "e_rnn", "_l0", f, h)?,
+            e_mlp: [dense("e_mlp.layers.0", 2 * h, w)?, dense("e_mlp.layers.1", w, h)?],
+            e_mu: dense("e_mu", h, s.latent)?,
+            e_logvar: dense("e_logvar", h, s.latent)?,
+            drnn_mlp: [dense("drnn_mlp.layers.0", h, w)?, dense("drnn_mlp.layers.1", w, h)?, dense("drnn_mlp.layers.2", h, h)?],
+            d_rnn: Gru::read(t, "d_rnn", "", h + s.latent + f, h)?,
+            d_mlp: [dense("d_mlp.layers.0", h, w)?, dense("d_mlp.layers.1", w, h)?],
+            d_out: dense("d_out", h, f)?,
+        })
+    }
+
+    /// All tensors under their file names.
+    pub fn named(&self) -> Vec<Named> {
+        let mut out = Vec::new();
+        self.x_enc.put("x_enc", "_l0", &mut out);
+        self.e_rnn.put("e_rnn", "_l0", &mut out);
+        for (i, d) in self.e_mlp.iter().enumerate() {
+            d.put(&format!("e_mlp.layers.{i}"), &mut out);
+        }
+        self.e_mu.put("e_mu", &mut out);
+        self.e_logvar.put("e_logvar", &mut out);
+        for (i, d) in self.drnn_mlp.iter().enumerate() {
+            d.put(&format!("drnn_mlp.layers.{i}"), &mut out);
+        }
+        self.d_rnn.put("d_rnn", "", &mut out);
+        for (i, d) in self.d_mlp.iter().enumerate() {
+            d.put(&format!("d_mlp.layers.{i}"), &mut out);
+        }
+        self.d_out.put("d_out", &mut out);
+        out
+    }
+}
+
+impl RegressorWeights {
+    /// Reads all tensors and checks their shapes against `s`.
+    pub fn read(t: &Tensors, s: RegressorSizes) -> Result<Self> {
+        let block = |i: usize| -> Result<[Dense; 2]> {
+            let layer = |k: usize| Dense::read(t, &format!("pnet.layers.{i}.layers.{k}"), s.width, s.width);
+            Ok([layer(0)?, layer(1)?])
+        };
+        Ok(Self {
+            passes: s.passes,
+            in_fc: Dense::read(t, "pnet.in_fc", RegressorSizes::INPUT, s.width)?,
+            blocks: (0..s.blocks).map(block).collect::<Result<_>>()?,
+            out_fc: Dense::read(t, "pnet.out_fc", s.width, CONTINUOUS)?,
+        })
+    }
+
+    /// All tensors under their file names.
+    pub fn named(&self) -> Vec<Named> {
+        let mut out = Vec::new();
+        self.in_fc.put("pnet.in_fc", &mut out);
+        for (i, block) in self.blocks.iter().enumerate() {
+            for (k, d) in block.iter().enumerate() {
+                d.put(&format!("pnet.layers.{i}.layers.{k}"), &mut out);
+            }
+        }
+        self.out_fc.put("pnet.out_fc", &mut out);
+        out
+    }
+}
+
+/// A whole motion model: configuration, both networks, and the content hash that policies name.
+#[derive(Clone, Debug)]
+pub struct MotionWeights {
+    pub config: MotionConfig,
+    pub predictor: PredictorWeights,
+    pub regressor: RegressorWeights,
+    /// SHA-256 over the hashes of the three files' contents.
+    pub hash: String,
+}
+
+impl MotionWeights {
+    /// Reads a motion-model folder.
+    ///
+    /// # Errors
+    /// Names the file and entry that is missing, malformed, or not of this program's time base or canonical convention.
+    pub fn load(dir: impl AsRef<Path>) -> Result<Self> {
+        let dir = dir.as_ref();
+        let path = dir.join(CONFIG_FILE);
+        let text = fs::read(&path).map_err(|e| Error::io(&path, e))?;
+        let config: MotionConfig = serde_json::from_slice(&text).map_err(|e| Error::file(&path, e.to_string()))?;
+        check(&path, &config)?;
+        let p = Tensors::read(dir.join(PREDICTOR_FILE))?;
+        let r = Tensors::read(dir.join(REGRESSOR_FILE))?;
+        let hash = content_hash([content_hash(&text), p.hash(), r.hash()].concat().as_bytes());
+        let predictor = PredictorWeights::read(&p, config.predictor)?;
+        let regressor = RegressorWeights::read(&r, config.regressor)?;
+        Ok(Self { config, predictor, regressor, hash })
+    }
+
+    /// Writes a motion-model folder, weights in half precision.
+    pub fn save(dir: impl AsRef<Path>, config: &MotionConfig, predictor: &PredictorWeights, regressor: &RegressorWeights) -> Result<()> {
+        let dir = dir.as_ref();
+        let none = BTreeMap::new();
+        write_atomic(dir.join(PREDICTOR_FILE), &pack_tensors(&predictor.named(), &none, Precision::Half)?)?;
+        write_atomic(dir.join(REGRESSOR_FILE), &pack_tensors(&regressor.named(), &none, Precision::Half)?)?;
+        let mut text = serde_json::to_vec_pretty(config).map_err(|e| Error::invalid(format!("{CONFIG_FILE}: {e}")))?;
+        text.push(b'\n');
+        write_atomic(dir.join(CONFIG_FILE), &text)
+    }
+}
+
+fn check(path: &Path, c: &MotionConfig) -> Result<()> {
+    let bad = |key: &str, value: String, want: String| Err(Error::file(path, format!("{key} is {value}, expected {want}")));
+    if c.fps != super::FPS {
+        return bad("fps", c.fps.to_string(), super::FPS.to_string());
+    }
+    if c.frames != super::FRAMES {
+        return bad("frames", c.frames.to_string(), super::FRAMES.to_string());
+    }
+    if c.canonical != "floor" {
+        return bad("canonical", format!("'{}'", c.canonical), "'floor'".into());
+    }
+    if c.predictor.frame != MARKER_DIM {
+        return bad("predictor.frame", c.predictor.frame.to_string(), MARKER_DIM.to_string());
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn folder_round_trip_and_checks() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut config = MotionConfig::new("body");
+        config.predictor = PredictorSizes { frame: MARKER_DIM, hidden: 4, wide: 6, latent: 3 };
+        config.regressor = RegressorSizes { width: 5, blocks: 2, passes: 3 };
+        let mut k = 0.0;
+        let mut dense = |input: usize, output: usize| {
+            k += 1.0;
+            Dense { input, output, weight: vec![k; input * output], bias: vec![-k; output] }
+        };
+        let gru = |input: usize, v: f32| Gru {
+            input,
+            hidden: 4,
+            weight_ih: vec![v; 12 * input],
+            weight_hh: vec![2.0 * v; 48],
+            bias_ih: vec![3.0 * v; 12],
+            bias_hh: vec![4.0 * v; 12],
+        };
+        let predictor = PredictorWeights {
+            x_enc: gru(201, 0.5),
+            e_rnn: gru(201, 0.25),
+            e_mlp: [dense(8, 6), dense(6, 4)],
+            e_mu: dense(4, 3),
+            e_logvar: dense(4, 3),
+            drnn_mlp: [dense(4, 6), dense(6, 4), dense(4, 4)],
+            d_rnn: gru(4 + 3 + 201, 0.125),
+            d_mlp: [dense(4, 6), dense(6, 4)],
+            d_out: dense(4, 201),
+        };
+        let regressor = RegressorWeights {
+            passes: 3,
+            in_fc: dense(370, 5),
+            blocks: vec![[dense(5, 5), dense(5, 5)], [dense(5, 5), dense(5, 5)]],
+            out_fc: dense(5, 159),
+        };
+        MotionWeights::save(dir.path(), &config, &predictor, &regressor).unwrap();
+        let back = MotionWeights::load(dir.path()).unwrap();
+        assert_eq!((&back.config, &back.predictor, &back.regressor), (&config, &predictor, &regressor));
+
+        config.regressor.width = 6;
+        write_atomic(dir.path().join(CONFIG_FILE), &serde_json::to_vec(&config).unwrap()).unwrap();
+        let e = MotionWeights::load(dir.path()).unwrap_err().to_string();
+        assert!(e.contains("regressor.safetensors") && e.contains("pnet.in_fc.weight") && e.contains("[6, 370]"), "{e}");
+        config.canonical = "pelvis".into();
+        write_atomic(dir.path().join(CONFIG_FILE), &serde_json::to_vec(&config).unwrap()).unwrap();
+        let e = MotionWeights::load(dir.path()).unwrap_err().to_string();
+        assert!(e.contains("canonical is 'pelvis', expected 'floor'"), "{e}");
+    }
+}

@@ -58,6 +58,28 @@ impl EnvSpec {
     pub fn obs_dim(&self) -> usize {
         self.obs.iter().map(ObsGroup::len).sum()
     }
+
+    /// Refuses a batch of actions for `n` environments that has the wrong size, is not finite or names no choice.
+    pub fn check_actions(&self, n: usize, actions: &[f32]) -> Result<(), EnvError> {
+        let width = self.action.width();
+        if actions.len() != n * width {
+            return Err(EnvError::Invalid(format!("{} action values, expected {n} x {width}", actions.len())));
+        }
+        let ok = |a: f32| match self.action {
+            ActionSpace::Continuous(_) => a.is_finite(),
+            ActionSpace::Discrete(k) => a >= 0.0 && a < k as f32 && a.fract() == 0.0,
+        };
+        match actions.iter().position(|&a| !ok(a)) {
+            Some(i) => Err(EnvError::Invalid(format!(
+                "action of environment {} holds {} at place {}, expected {:?}",
+                i / width,
+                actions[i],
+                i % width,
+                self.action
+            ))),
+            None => Ok(()),
+        }
+    }
 }
 
 /// What a batch of n environments returns from one step. Buffers are owned by the caller and reused.
@@ -77,6 +99,25 @@ pub struct StepResult {
     pub info: Vec<f32>,
     /// n x episode.len(): figures of the episode that ended in this step; zero where none ended.
     pub episode: Vec<f32>,
+}
+
+impl StepResult {
+    /// Sizes all buffers for `n` environments of `spec` and zeroes them.
+    pub fn prepare(&mut self, spec: &EnvSpec, n: usize) {
+        let zero = |v: &mut Vec<f32>, len| {
+            v.clear();
+            v.resize(len, 0.0);
+        };
+        zero(&mut self.obs, n * spec.obs_dim());
+        zero(&mut self.final_obs, n * spec.obs_dim());
+        zero(&mut self.reward, n);
+        zero(&mut self.info, n * spec.info.len());
+        zero(&mut self.episode, n * spec.episode.len());
+        for flags in [&mut self.terminated, &mut self.truncated] {
+            flags.clear();
+            flags.resize(n, false);
+        }
+    }
 }
 
 /// Why an environment refused a step.

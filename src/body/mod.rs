@@ -3,9 +3,11 @@
 mod frame;
 mod model;
 pub mod rotation;
+mod shaped;
 
 pub use frame::{Frame, canonical_frame};
-pub use model::{BodyModel, Posed, ShapedBody};
+pub use model::BodyModel;
+pub use shaped::{Posed, ShapedBody, local_rotations};
 
 use std::ops::Range;
 

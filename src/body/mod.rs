@@ -52,3 +52,6 @@ pub mod joint {
     pub const L_EYE: usize = 22;
     pub const R_EYE: usize = 23;
 }
+
+#[cfg(test)]
+pub(crate) mod tests;

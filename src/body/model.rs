@@ -44,7 +44,8 @@ impl BodyModel {
         let v = template.len();
         let parents = t.ints("parents", &[JOINTS])?;
         if let Some(k) = (1..JOINTS).find(|&k| parents[k] != PARENTS[k] as i32) {
-            let what = format!("tensor 'parents' entry {k} is {}, expected {} (SMPL-X's body joints, then the eyes)", parents[k], PARENTS[k]);
+            let what =
+                format!("tensor 'parents' entry {k} is {}, expected {} (SMPL-X's body joints, then the eyes)", parents[k], PARENTS[k]);
             return Err(Error::file(t.origin(), what));
         }
         let joint_dirs = directions(&t.f32s("joint_dirs", &[JOINTS, 3, BETAS])?);

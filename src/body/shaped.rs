@@ -136,7 +136,12 @@ impl ShapedBody {
     ///
     /// `posed` is what [`ShapedBody::pose_rotations`] made of `rot_local`. The 9 entries of a rotation (row-major) are taken
     /// as free numbers: the caller chains with the derivative of its own parametrisation.
-    pub fn markers_backward(&self, posed: &Posed, rot_local: &[Mat3; BODY_JOINTS], grad: &[f32; MARKER_DIM]) -> ([f32; 3], [[f32; 9]; BODY_JOINTS]) {
+    pub fn markers_backward(
+        &self,
+        posed: &Posed,
+        rot_local: &[Mat3; BODY_JOINTS],
+        grad: &[f32; MARKER_DIM],
+    ) -> ([f32; 3], [[f32; 9]; BODY_JOINTS]) {
         let mut rot = [Mat3::ZERO; JOINTS];
         let mut pos = [Vec3::ZERO; JOINTS];
         for (i, g) in grad.as_chunks::<3>().0.iter().enumerate() {

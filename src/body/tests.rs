@@ -1,0 +1,181 @@
+//! Tests of shape, kinematics, skinning and the adjoint on a small made-up body.
+
+use super::*;
+use crate::rng::stream;
+use glam::{Mat3, Vec3};
+use proptest::prelude::*;
+use rand::{Rng, RngExt};
+
+/// A body with random proportions: pelvis off the origin, shape moving everything, four bones on each vertex.
+pub(crate) fn toy() -> BodyModel {
+    let mut rng = stream(1, "toy-body", 0);
+    let v = 2 * MARKERS;
+    let mut point = |scale: f32| vec3(&mut rng, scale);
+    let template: Vec<Vec3> = (0..v).map(|_| point(0.8)).collect();
+    let shapedirs = (0..v).map(|_| std::array::from_fn(|_| point(0.02))).collect();
+    let joints = std::array::from_fn(|_| point(0.6));
+    let joint_dirs = std::array::from_fn(|_| std::array::from_fn(|_| point(0.02)));
+    let skin =
+        (0..v).map(|i| shaped::Skin { bone: [i % 22, (i * 7 + 3) % 24, (i * 5 + 1) % 24, 22], weight: [0.4, 0.3, 0.2, 0.1] }).collect();
+    BodyModel {
+        template,
+        shapedirs,
+        joints,
+        joint_dirs,
+        skin,
+        faces: vec![[0, 1, 2]],
+        uv: vec![[0.0; 2]; 3],
+        uv_faces: vec![[0, 1, 2]],
+        part: vec![0; v],
+        foot_vertices: vec![0],
+        markers: std::array::from_fn(|i| 2 * i + 1),
+        hash: "toy".into(),
+    }
+}
+
+fn vec3(rng: &mut impl Rng, scale: f32) -> Vec3 {
+    Vec3::from_array(std::array::from_fn(|_| rng.random_range(-scale..scale)))
+}
+
+fn random_params(seed: u64) -> [f32; PARAMS] {
+    let mut rng = stream(seed, "params", 0);
+    std::array::from_fn(|_| rng.random_range(-1.0..1.0))
+}
+
+fn random_betas(seed: u64) -> [f32; BETAS] {
+    let mut rng = stream(seed, "betas", 0);
+    std::array::from_fn(|_| rng.random_range(-2.0..2.0))
+}
+
+fn close(a: &[f32], b: &[f32], tolerance: f32) -> bool {
+    a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a - b).abs() <= tolerance)
+}
+
+#[test]
+fn rest_pose_gives_rest_markers_and_joints() {
+    let model = toy();
+    let body = model.shape(&random_betas(3));
+    let mut params = [0.0; PARAMS];
+    params[0..3].copy_from_slice(&[1.0, 2.0, 3.0]);
+    let posed = body.pose(&params);
+    let mut markers = [0.0; MARKER_DIM];
+    body.markers(&posed, &mut markers);
+    let shift = Vec3::new(1.0, 2.0, 3.0);
+    for k in 0..JOINTS {
+        assert!((posed.pos[k] - body.joints()[k] - shift).length() < 1e-5);
+    }
+    for (m, v) in markers.as_chunks::<3>().0.iter().zip(body.rest_markers()) {
+        assert!((Vec3::from(*m) - *v - shift).length() < 1e-5);
+    }
+    // Shape: template + sum of beta x direction, by hand for one coordinate of one marker and one joint.
+    let (b, id) = (random_betas(3), model.markers[5]);
+    let hand = model.template[id].y + (0..BETAS).map(|k| b[k] * model.shapedirs[id][k].y).sum::<f32>();
+    assert!((body.rest_markers()[5].y - hand).abs() < 1e-6);
+    let hand = model.joints[0].x + (0..BETAS).map(|k| b[k] * model.joint_dirs[0][k].x).sum::<f32>();
+    assert!((body.joints()[0].x - hand).abs() < 1e-6);
+}
+
+#[test]
+fn one_bent_knee_by_hand() {
+    let body = toy().shape(&[0.0; BETAS]);
+    let mut params = [0.0; PARAMS];
+    // Left knee a quarter turn about x: y to z, z to -y.
+    params[3 + 3 * joint::L_KNEE] = std::f32::consts::FRAC_PI_2;
+    let posed = body.pose(&params);
+    let rest = body.joints();
+    for k in 0..JOINTS {
+        let o = rest[k] - rest[joint::L_KNEE];
+        let below = k == joint::L_ANKLE || k == joint::L_FOOT;
+        let want = if below { rest[joint::L_KNEE] + Vec3::new(o.x, -o.z, o.y) } else { rest[k] };
+        assert!((posed.pos[k] - want).length() < 1e-6, "joint {k}");
+    }
+    assert_eq!(posed.view(), Vec3::Z);
+    assert!((posed.eye_centre() - 0.5 * (rest[22] + rest[23])).length() < 1e-6);
+}
+
+#[test]
+fn markers_are_vertices_of_the_skinned_mesh() {
+    let model = toy();
+    let body = model.shape(&random_betas(1));
+    let params = random_params(2);
+    let posed = body.pose(&params);
+    let mut mesh = Vec::new();
+    model.skin(&body, &posed, &mut mesh);
+    let mut markers = [0.0; MARKER_DIM];
+    body.markers(&posed, &mut markers);
+    for (m, &id) in markers.as_chunks::<3>().0.iter().zip(model.marker_vertices()) {
+        assert!((Vec3::from(*m) - mesh[id]).length() < 2e-6);
+    }
+    let two: Vec<f32> = [params, random_params(9)].concat();
+    let mut batch = vec![0.0; 2 * MARKER_DIM];
+    body.markers_batch(&two, &mut batch);
+    assert_eq!(batch[..MARKER_DIM], markers);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn transformed_parameters_move_every_marker(seed in 0u64..1000, turn in [-3.0f32..3.0, -3.0f32..3.0, -3.0f32..3.0], shift in [-5.0f32..5.0, -5.0f32..5.0, -5.0f32..5.0]) {
+        let body = toy().shape(&random_betas(seed));
+        prop_assert!(body.joints()[0].length() > 1e-3);
+        let frame = Frame { rot: rotation::from_axis_angle(turn.into()), transl: shift.into() };
+        let mut params = random_params(seed);
+        let mut before = [0.0; MARKER_DIM];
+        body.markers(&body.pose(&params), &mut before);
+        body.transform_params(&mut params, &frame);
+        let mut after = [0.0; MARKER_DIM];
+        let posed = body.pose(&params);
+        body.markers(&posed, &mut after);
+        let moved: Vec<f32> = before.as_chunks::<3>().0.iter().flat_map(|&p| frame.point(p.into()).to_array()).collect();
+        prop_assert!(close(&moved, &after, 1e-5));
+    }
+}
+
+/// The scalar of the gradient test, in double precision to leave room for small differences.
+fn weighted(body: &ShapedBody, local: &[Mat3; BODY_JOINTS], transl: Vec3, grad: &[f32]) -> f64 {
+    let mut markers = [0.0; MARKER_DIM];
+    body.markers(&body.pose_rotations(local, transl), &mut markers);
+    markers.iter().zip(grad).map(|(&m, &g)| m as f64 * g as f64).sum()
+}
+
+#[test]
+fn adjoint_matches_differences() {
+    let body = toy().shape(&random_betas(4));
+    let params = random_params(5);
+    let (mut local, transl) = (local_rotations(&params), Vec3::from_slice(&params));
+    let mut rng = stream(6, "grad", 0);
+    let grad: [f32; MARKER_DIM] = std::array::from_fn(|_| rng.random_range(-1.0..1.0));
+    let (g_transl, g_rot) = body.markers_backward(&body.pose_rotations(&local, transl), &local, &grad);
+    // The markers are linear in each single entry, so a large step has no truncation error.
+    let h = 0.5f32;
+    let mut largest = 0.0f64;
+    for k in 0..BODY_JOINTS {
+        for e in 0..9 {
+            let mut at = |d: f32| {
+                local[k].col_mut(e % 3)[e / 3] += d;
+                let value = weighted(&body, &local, transl, &grad);
+                local[k].col_mut(e % 3)[e / 3] -= d;
+                value
+            };
+            let difference = (at(h) - at(-h)) / (2.0 * h as f64);
+            assert!((difference - g_rot[k][e] as f64).abs() < 2e-4, "joint {k} entry {e}: {difference} {}", g_rot[k][e]);
+            largest = largest.max(difference.abs());
+        }
+    }
+    assert!(largest > 1.0);
+    for (axis, &g) in Vec3::AXES.iter().zip(&g_transl) {
+        let difference = weighted(&body, &local, transl + *axis, &grad) - weighted(&body, &local, transl, &grad);
+        assert!((difference - g as f64).abs() < 2e-4);
+    }
+}
+
+#[test]
+fn refuses_a_broken_asset() {
+    let error = BodyModel::from_bytes("body.safetensors", b"not tensors").err().unwrap().to_string();
+    assert!(error.contains("body.safetensors"), "{error}");
+    let bytes =
+        crate::io::pack_tensors(&[("v_template".into(), vec![2, 2], vec![0.0; 4])], &Default::default(), crate::io::Precision::Full);
+    let error = BodyModel::from_bytes("b", &bytes.unwrap()).err().unwrap().to_string();
+    assert!(error.contains("v_template") && error.contains("[2, 2]"), "{error}");
+}

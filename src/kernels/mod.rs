@@ -1,1 +1,13 @@
-//! (to come)
+//! Fast f32 inference on the processor, for the frozen networks and for acting.
+//!
+//! A product runs over weights packed once into column panels; bias, activation and residual are applied while a tile is
+//! in the first-level cache. Every element is one chain of fused multiply-adds over the inputs in their order, so a row's
+//! result is the same bits on every instruction set, in every batch and on any number of threads.
+//! This is the only module with `unsafe`, all of it in `simd`.
+
+mod gru;
+mod linear;
+mod simd;
+
+pub use gru::GruCell;
+pub use linear::{Activation, Linear, Source, View, ViewMut};

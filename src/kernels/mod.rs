@@ -7,7 +7,10 @@
 
 mod gru;
 mod linear;
+mod motion;
+mod pool;
 mod simd;
 
 pub use gru::GruCell;
 pub use linear::{Activation, Linear, Source, View, ViewMut};
+pub use motion::{Decoder, MotionEngine, Regressor};

@@ -1,0 +1,56 @@
+//! The networks must say the same on every device of this build. Run with `--features ndarray` to compare two.
+#![cfg(feature = "ndarray")]
+
+use burn::tensor::Device;
+use egogen::DeviceChoice;
+use egogen::agent::{Network, ObsGroup, ObsLayout, PolicyConfig, PolicySpec};
+use egogen::rng::stream;
+use rand_distr::{Distribution, StandardNormal};
+use std::collections::BTreeMap;
+
+/// The paper's policy at a quarter of its width: two GRUs, encoded scalars, residual blocks.
+fn policy() -> PolicySpec {
+    let group = |name: &str, shape: &[usize]| ObsGroup { name: name.into(), shape: shape.into() };
+    let layout = ObsLayout::new(vec![group("state", &[2, 402]), group("egosensing", &[2, 32]), group("dist", &[1]), group("time", &[1])]);
+    let config = PolicyConfig {
+        gru: BTreeMap::from([("state".into(), 128), ("egosensing".into(), 128)]),
+        octaves: 12,
+        trunk: None,
+        blocks: 2,
+        logvar: [-2.5, 2.5],
+        actor_scale: Default::default(),
+    };
+    PolicySpec::new(config, layout, 128).expect("sizes are good")
+}
+
+/// Outputs of the policy and the gradient of a loss that touches all of them.
+fn outputs_and_gradient(spec: &PolicySpec, flat: &[f32], obs: &[f32], device: Device) -> (Vec<f32>, Vec<f32>) {
+    let network = Network::new(spec, flat, &device.autodiff());
+    let out = network.forward(obs);
+    let mut all = Vec::new();
+    for part in [out.mu.clone().into_data(), out.logvar.clone().into_data(), out.value.clone().into_data()] {
+        all.extend_from_slice(part.as_slice::<f32>().expect("outputs are f32"));
+    }
+    let loss = out.mu.powf_scalar(2.0).mean() + out.logvar.exp().mean() + (out.value - 1.0).powf_scalar(2.0).mean();
+    let mut gradient = vec![0.0; spec.params()];
+    network.add_gradients(&mut loss.backward(), &mut gradient);
+    (all, gradient)
+}
+
+fn assert_close(a: &[f32], b: &[f32], what: &str) {
+    let scale = a.iter().fold(0.0f32, |m, x| m.max(x.abs()));
+    let worst = a.iter().zip(b).fold(0.0f32, |m, (x, y)| m.max((x - y).abs()));
+    assert!(scale > 0.0 && worst <= 1e-4 * scale, "{what} differ by {worst} at a scale of {scale}");
+}
+
+#[test]
+fn ndarray_agrees_with_flex_on_the_policy() {
+    let spec = policy();
+    let flat = spec.init(1);
+    let obs: Vec<f32> = StandardNormal.sample_iter(stream(1, "devices", 0)).take(33 * spec.layout.dim()).collect();
+    let device = |choice: DeviceChoice| choice.device().expect("built in");
+    let (flex, flex_gradient) = outputs_and_gradient(&spec, &flat, &obs, device(DeviceChoice::Flex));
+    let (ndarray, ndarray_gradient) = outputs_and_gradient(&spec, &flat, &obs, device(DeviceChoice::NdArray));
+    assert_close(&flex, &ndarray, "outputs");
+    assert_close(&flex_gradient, &ndarray_gradient, "gradients");
+}

@@ -2,6 +2,7 @@
 
 mod camera;
 mod canvas;
+mod episode;
 mod film;
 mod font;
 mod image;
@@ -12,6 +13,7 @@ mod top_view;
 
 pub use camera::Camera;
 pub use canvas::Canvas;
+pub use episode::{Block, Episode, Walker};
 pub use film::{film, tile};
 pub use image::{Image, Rgb, ramp};
 pub use mesh::Mesh;

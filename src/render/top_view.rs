@@ -7,6 +7,8 @@ use glam::Vec2;
 
 const MARGIN: f32 = 24.0;
 const LABEL: usize = 2;
+/// Pixels of a person's path.
+pub const PATH_WIDTH: f32 = 3.0;
 
 /// A plan of a rectangle of the world, drawn in metres.
 pub struct TopView {

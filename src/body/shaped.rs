@@ -80,6 +80,14 @@ impl ShapedBody {
         &self.rest
     }
 
+    /// The bone that weighs most on each marker, and its weight.
+    pub fn marker_bones(&self) -> impl ExactSizeIterator<Item = (usize, f32)> + '_ {
+        self.skin.iter().map(|s| {
+            let b = (1..BONES).fold(0, |top, b| if s.weight[b] > s.weight[top] { b } else { top });
+            (s.bone[b], s.weight[b])
+        })
+    }
+
     /// Poses the body by `params` (93 floats; hands are ignored).
     ///
     /// The pelvis turns about its own rest joint J_0: R_0 = global orientation, x_0 = J_0 + translation; below it

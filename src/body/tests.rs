@@ -6,7 +6,7 @@ use glam::{Mat3, Vec3};
 use proptest::prelude::*;
 use rand::{Rng, RngExt};
 
-/// A body with random proportions: pelvis off the origin, shape moving everything, four bones on each vertex.
+/// A body with random proportions: pelvis off the origin, shape moving everything, one or four bones on each vertex.
 pub(crate) fn toy() -> BodyModel {
     let mut rng = stream(1, "toy-body", 0);
     let v = 2 * MARKERS;
@@ -15,14 +15,16 @@ pub(crate) fn toy() -> BodyModel {
     let shapedirs = (0..v).map(|_| std::array::from_fn(|_| point(0.02))).collect();
     let joints = std::array::from_fn(|_| point(0.6));
     let joint_dirs = std::array::from_fn(|_| std::array::from_fn(|_| point(0.02)));
-    let skin =
-        (0..v).map(|i| shaped::Skin { bone: [i % 22, (i * 7 + 3) % 24, (i * 5 + 1) % 24, 22], weight: [0.4, 0.3, 0.2, 0.1] }).collect();
+    let skin = (0..v).map(|i| {
+        let weight = if i % 4 == 1 { [1.0, 0.0, 0.0, 0.0] } else { [0.4, 0.3, 0.2, 0.1] };
+        shaped::Skin { bone: [i % 22, (i * 7 + 3) % 24, (i * 5 + 1) % 24, 22], weight }
+    });
     BodyModel {
         template,
         shapedirs,
         joints,
         joint_dirs,
-        skin,
+        skin: skin.collect(),
         faces: vec![[0, 1, 2]],
         uv: vec![[0.0; 2]; 3],
         uv_faces: vec![[0, 1, 2]],
@@ -37,7 +39,7 @@ fn vec3(rng: &mut impl Rng, scale: f32) -> Vec3 {
     Vec3::from_array(std::array::from_fn(|_| rng.random_range(-scale..scale)))
 }
 
-fn random_params(seed: u64) -> [f32; PARAMS] {
+pub(crate) fn random_params(seed: u64) -> [f32; PARAMS] {
     let mut rng = stream(seed, "params", 0);
     std::array::from_fn(|_| rng.random_range(-1.0..1.0))
 }

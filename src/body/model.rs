@@ -6,6 +6,7 @@ use crate::io::Tensors;
 use crate::{Error, Result};
 use glam::Vec3;
 use std::path::Path;
+use std::sync::{Arc, LazyLock};
 
 /// Bones that move one vertex.
 pub(super) const BONES: usize = 4;
@@ -37,6 +38,15 @@ impl BodyModel {
     /// Reads a body asset from the content of a file; `origin` names it in errors.
     pub fn from_bytes(origin: impl AsRef<Path>, bytes: &[u8]) -> Result<Self> {
         Self::from_tensors(&Tensors::from_bytes(origin, bytes.to_vec())?)
+    }
+
+    /// The body that ships inside the library, read once.
+    pub fn embedded() -> Arc<Self> {
+        static BODY: LazyLock<Arc<BodyModel>> = LazyLock::new(|| {
+            let bytes = include_bytes!("../../checkpoints/body/body.safetensors");
+            Arc::new(BodyModel::from_bytes("checkpoints/body/body.safetensors", bytes).expect("the shipped asset is checked by a test"))
+        });
+        BODY.clone()
     }
 
     fn from_tensors(t: &Tensors) -> Result<Self> {

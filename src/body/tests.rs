@@ -181,3 +181,29 @@ fn refuses_a_broken_asset() {
     let error = BodyModel::from_bytes("b", &bytes.unwrap()).err().unwrap().to_string();
     assert!(error.contains("v_template") && error.contains("[2, 2]"), "{error}");
 }
+
+#[test]
+fn embedded_body_matches_numpy() {
+    let model = BodyModel::embedded();
+    let file = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/body_lbs.safetensors");
+    let t = crate::io::Tensors::read(file).unwrap();
+    let get = |name: &str, shape: &[usize]| t.f32s(name, shape).unwrap();
+    let (betas, params, joints) = (get("betas", &[4, BETAS]), get("params", &[4, PARAMS]), get("joints", &[4, JOINTS, 3]));
+    let (markers, vertices, mean) = (get("markers", &[4, MARKERS, 3]), get("vertices", &[4, 64, 3]), get("vertex_sum", &[4, 3]));
+    let ids = t.indices("vertex_ids", &[64], model.vertex_count()).unwrap();
+    for i in 0..4 {
+        let body = model.shape(&betas[i * BETAS..][..BETAS]);
+        let posed = body.pose(&params[i * PARAMS..][..PARAMS]);
+        let mut out = vec![0.0; MARKER_DIM];
+        body.markers(&posed, &mut out);
+        assert!(close(&out, &markers[i * MARKER_DIM..][..MARKER_DIM], 1e-5), "markers {i}");
+        posed.write_joints(&mut out[..3 * JOINTS]);
+        assert!(close(&out[..3 * JOINTS], &joints[i * 3 * JOINTS..][..3 * JOINTS], 1e-5), "joints {i}");
+        let mut mesh = Vec::new();
+        model.skin(&body, &posed, &mut mesh);
+        let picked: Vec<f32> = ids.iter().flat_map(|&id| mesh[id].to_array()).collect();
+        assert!(close(&picked, &vertices[i * 192..][..192], 1e-5), "vertices {i}");
+        let centre: Vec3 = mesh.iter().sum::<Vec3>() / mesh.len() as f32;
+        assert!(close(&centre.to_array(), &mean[3 * i..][..3], 1e-4), "mean {i}");
+    }
+}

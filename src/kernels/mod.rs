@@ -3,14 +3,16 @@
 //! A product runs over weights packed once into column panels; bias, activation and residual are applied while a tile is
 //! in the first-level cache. Every element is one chain of fused multiply-adds over the inputs in their order, so a row's
 //! result is the same bits on every instruction set, in every batch and on any number of threads.
-//! This is the only module with `unsafe`, all of it in `simd`.
+//! Training uses general products instead (`product`). This is the only module with `unsafe`: in `simd` and `product`.
 
 mod gru;
 mod linear;
 mod motion;
 mod pool;
+mod product;
 mod simd;
 
 pub use gru::GruCell;
 pub use linear::{Activation, Linear, Source, View, ViewMut};
 pub use motion::{Decoder, MotionEngine, Regressor};
+pub use product::{Mat, product};

@@ -1,9 +1,14 @@
 //! Motion: clips, canonical primitives, the motion-primitive model.
 
+mod net;
+mod predictor;
+mod regressor;
 mod weights;
 
+pub use predictor::Predictor;
+pub use regressor::Regressor;
 pub use weights::{
-    CONFIG_FILE, CONTINUOUS, Dense, Gru, MotionConfig, MotionWeights, Named, PREDICTOR_FILE, PredictorSizes, PredictorWeights,
+    CONFIG_FILE, CONTINUOUS, Dense, Gru, MotionConfig, MotionWeights, Named, PREDICTOR_FILE, Parameters, PredictorSizes, PredictorWeights,
     REGRESSOR_FILE, RegressorSizes, RegressorWeights,
 };
 

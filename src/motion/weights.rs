@@ -168,6 +168,19 @@ pub struct RegressorWeights {
     pub out_fc: Dense,
 }
 
+/// Access to all numbers of a network in the order of its named tensors.
+pub trait Parameters: Clone {
+    /// All tensors.
+    fn tensors_mut(&mut self) -> Vec<&mut Vec<f32>>;
+
+    /// The same shapes, all zero: room for gradients.
+    fn zeros(&self) -> Self {
+        let mut zeros = self.clone();
+        zeros.tensors_mut().into_iter().for_each(|t| t.fill(0.0));
+        zeros
+    }
+}
+
 /// One named tensor: name, shape, row-major data.
 pub type Named = (String, Vec<usize>, Vec<f32>);
 
@@ -180,6 +193,10 @@ impl Dense {
     fn put(&self, name: &str, out: &mut Vec<Named>) {
         out.push((format!("{name}.weight"), vec![self.output, self.input], self.weight.clone()));
         out.push((format!("{name}.bias"), vec![self.output], self.bias.clone()));
+    }
+
+    fn tensors_mut(&mut self) -> [&mut Vec<f32>; 2] {
+        [&mut self.weight, &mut self.bias]
     }
 }
 
@@ -203,6 +220,10 @@ impl Gru {
         out.push((format!("{name}.weight_hh{suffix}"), vec![gates, self.hidden], self.weight_hh.clone()));
         out.push((format!("{name}.bias_ih{suffix}"), vec![gates], self.bias_ih.clone()));
         out.push((format!("{name}.bias_hh{suffix}"), vec![gates], self.bias_hh.clone()));
+    }
+
+    fn tensors_mut(&mut self) -> [&mut Vec<f32>; 4] {
+        [&mut self.weight_ih, &mut self.weight_hh, &mut self.bias_ih, &mut self.bias_hh]
     }
 }
 
@@ -243,6 +264,24 @@ impl PredictorWeights {
         }
         self.d_out.put("d_out", &mut out);
         out
+    }
+}
+
+impl Parameters for PredictorWeights {
+    fn tensors_mut(&mut self) -> Vec<&mut Vec<f32>> {
+        let Self { x_enc, e_rnn, e_mlp, e_mu, e_logvar, drnn_mlp, d_rnn, d_mlp, d_out } = self;
+        let mut out: Vec<&mut Vec<f32>> = x_enc.tensors_mut().into_iter().chain(e_rnn.tensors_mut()).collect();
+        out.extend(e_mlp.iter_mut().chain([e_mu, e_logvar]).chain(drnn_mlp).flat_map(Dense::tensors_mut));
+        out.extend(d_rnn.tensors_mut());
+        out.extend(d_mlp.iter_mut().chain([d_out]).flat_map(Dense::tensors_mut));
+        out
+    }
+}
+
+impl Parameters for RegressorWeights {
+    fn tensors_mut(&mut self) -> Vec<&mut Vec<f32>> {
+        let layers = std::iter::once(&mut self.in_fc).chain(self.blocks.iter_mut().flatten()).chain([&mut self.out_fc]);
+        layers.flat_map(Dense::tensors_mut).collect()
     }
 }
 
@@ -373,6 +412,9 @@ mod tests {
             blocks: vec![[dense(5, 5), dense(5, 5)], [dense(5, 5), dense(5, 5)]],
             out_fc: dense(5, 159),
         };
+        let (mut p, mut r) = (predictor.clone(), regressor.clone());
+        assert!(p.tensors_mut().into_iter().zip(predictor.named()).all(|(a, (_, _, b))| *a == b));
+        assert!(r.tensors_mut().into_iter().zip(regressor.named()).all(|(a, (_, _, b))| *a == b));
         MotionWeights::save(dir.path(), &config, &predictor, &regressor).unwrap();
         let back = MotionWeights::load(dir.path()).unwrap();
         assert_eq!((&back.config, &back.predictor, &back.regressor), (&config, &predictor, &regressor));

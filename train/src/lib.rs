@@ -1,1 +1,3 @@
 //! The learning: collector, GAE, PPO, trainer, checkpoints, loggers; and the programs.
+
+pub mod primitives;

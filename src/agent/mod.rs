@@ -6,5 +6,5 @@ mod network;
 mod spec;
 
 pub use gaussian::{entropy, kl_to_prior, log_prob, log_prob_of};
-pub use network::{Network, Output};
+pub use network::{Network, Output, SLOPE};
 pub use spec::{ActorScale, Dense, Encoder, LAYOUT_VERSION, ObsGroup, ObsLayout, Part, PolicyConfig, PolicySpec};

@@ -9,7 +9,7 @@ use burn::tensor::module::linear;
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
 
 /// Slope of the leaky ReLU below zero.
-const SLOPE: f32 = 0.01;
+pub const SLOPE: f32 = 0.01;
 
 /// What the network says about n observations.
 pub struct Output {

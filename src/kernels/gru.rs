@@ -61,13 +61,37 @@ impl GruCell {
     /// # Panics
     /// If a slice is too short.
     pub fn step(&self, rows: usize, x: View, constant: Source, h: &mut [f32], scratch: &mut [f32]) {
-        let (size, gates) = (self.size(), 3 * self.size());
-        let (input, hidden) = scratch.split_at_mut(gates * rows);
-        self.input.forward(rows, x, ViewMut::new(input, gates), constant, Activation::None);
-        self.hidden.forward(rows, View::new(h, size), ViewMut::new(hidden, gates), Source::Fresh, Activation::None);
+        let (input, hidden) = scratch.split_at_mut(3 * self.size() * rows);
+        self.hidden.forward(rows, View::new(h, self.size()), ViewMut::new(hidden, 3 * self.size()), Source::Fresh, Activation::None);
+        self.input.forward(rows, x, ViewMut::new(input, 3 * self.size()), constant, Activation::None);
+        self.gates(rows, input, hidden, h);
+    }
+
+    /// The last state after `frames` frames that follow one another in each row of `x`, from state zero. `h`: rows x H.
+    ///
+    /// # Panics
+    /// If a slice is too short.
+    pub fn encode(&self, rows: usize, frames: usize, x: View, h: &mut [f32], scratch: &mut [f32]) {
+        h.fill(0.0);
+        for frame in 0..frames {
+            let x = View::new(&x.data[frame * self.inputs()..], x.stride);
+            if frame > 0 {
+                self.step(rows, x, Source::Fresh, h, scratch);
+                continue;
+            }
+            // The product with a zero state is known: it is the bias.
+            let (input, hidden) = scratch.split_at_mut(3 * self.size() * rows);
+            hidden.chunks_exact_mut(3 * self.size()).take(rows).for_each(|row| self.hidden.copy_bias(row));
+            self.input.forward(rows, x, ViewMut::new(input, 3 * self.size()), Source::Fresh, Activation::None);
+            self.gates(rows, input, hidden, h);
+        }
+    }
+
+    fn gates(&self, rows: usize, input: &[f32], hidden: &[f32], h: &mut [f32]) {
+        let gates = 3 * self.size();
         let products = input.chunks_exact(gates).zip(hidden.chunks_exact(gates));
         let isa = Isa::best();
-        for (h, (input, hidden)) in h.chunks_exact_mut(size).zip(products).take(rows) {
+        for (h, (input, hidden)) in h.chunks_exact_mut(self.size()).zip(products).take(rows) {
             simd::gates(isa, input, hidden, h);
         }
     }
@@ -95,6 +119,9 @@ mod tests {
                 h.iter().zip(want).for_each(|(a, b)| assert!((a - b).abs() < 1e-6, "row {r} frame {f}: {a} {b}"));
             }
         }
+        let mut encoded = vec![f32::NAN; rows * size];
+        cell.encode(rows, frames, View::new(&x, frames * inputs), &mut encoded, &mut scratch);
+        assert_eq!(encoded, h);
     }
 
     #[test]

@@ -120,6 +120,11 @@ impl Linear {
         self.outputs
     }
 
+    /// Copies the bias to `row`.
+    pub(super) fn copy_bias(&self, row: &mut [f32]) {
+        row.chunks_mut(PANEL).zip(&self.bias).for_each(|(row, bias)| row.copy_from_slice(&bias.0[..row.len()]));
+    }
+
     /// Computes `rows` rows on this thread. `x`: rows of `inputs`; `y`: rows of `outputs`.
     ///
     /// # Panics
@@ -156,6 +161,11 @@ impl Linear {
             }
         }
     }
+}
+
+/// `layer` on contiguous rows.
+pub(super) fn dense(layer: &Linear, rows: usize, x: &[f32], y: &mut [f32], source: Source, activation: Activation) {
+    layer.forward(rows, View::new(x, layer.inputs), ViewMut::new(y, layer.outputs), source, activation);
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@
 mod gru;
 mod linear;
 mod motion;
+mod policy;
 mod pool;
 mod product;
 mod simd;
@@ -15,4 +16,5 @@ mod simd;
 pub use gru::GruCell;
 pub use linear::{Activation, Linear, Source, View, ViewMut};
 pub use motion::{Decoder, MotionEngine, Regressor};
+pub use policy::PolicyEngine;
 pub use product::{Mat, product};

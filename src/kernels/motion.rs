@@ -1,11 +1,12 @@
 //! The frozen motion model: decoder of marker primitives and body regressor.
 
-use super::pool::{Pool, take};
-use super::{Activation, GruCell, Linear, Source, View, ViewMut};
+use super::linear::dense;
+use super::pool::{Pool, check, take};
+use super::{Activation, GruCell, Linear, Source, View};
+use crate::Result;
 use crate::body::rotation::{from_6d, to_axis_angle};
 use crate::body::{BETAS, BODY_JOINTS, HANDS, MARKER_DIM, ORIENT, PARAMS, POSE, TRANSL};
 use crate::motion::{CONTINUOUS, Dense, FUTURE, MotionModel, MotionWeights, PredictorWeights, RegressorWeights, SEED};
-use crate::{Error, Result};
 use glam::Vec3;
 use std::ops::Range;
 use std::path::Path;
@@ -17,15 +18,6 @@ const REGRESSOR_ROWS: usize = 128;
 
 fn linear(d: &Dense) -> Result<Linear> {
     Linear::new(&d.weight, &d.bias, d.input)
-}
-
-/// `layer` on contiguous rows.
-fn dense(layer: &Linear, rows: usize, x: &[f32], y: &mut [f32], source: Source, activation: Activation) {
-    layer.forward(rows, View::new(x, layer.inputs()), ViewMut::new(y, layer.outputs()), source, activation);
-}
-
-fn check(what: &str, have: usize, want: usize) -> Result<()> {
-    if have == want { Ok(()) } else { Err(Error::invalid(format!("{what} has {have} floats, expected {want}"))) }
 }
 
 /// The decoder of the marker predictor: seed frames and latent to future frames.
@@ -96,10 +88,7 @@ impl Decoder {
         let cell = take(&mut scratch, self.d_rnn.scratch(rows));
         let wide = scratch;
 
-        h_x.fill(0.0);
-        for t in 0..SEED {
-            self.x_enc.step(rows, View::new(&seed[t * MARKER_DIM..], SEED * MARKER_DIM), Source::Fresh, h_x, cell);
-        }
+        self.x_enc.encode(rows, SEED, View::new(seed, SEED * MARKER_DIM), h_x, cell);
         // The two parts share one buffer: the second adds to the first in place, both being linear.
         dense(&self.constant[0], rows, h_x, constant, Source::Fresh, Activation::None);
         dense(&self.constant[1], rows, latent, constant, Source::Residual, Activation::None);

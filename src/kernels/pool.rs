@@ -1,5 +1,6 @@
 //! Work spread over threads in blocks of rows, with scratch memory that is kept between calls.
 
+use crate::{Error, Result};
 use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
 
@@ -43,4 +44,9 @@ pub(super) fn take<'a>(scratch: &mut &'a mut [f32], len: usize) -> &'a mut [f32]
     let (head, tail) = std::mem::take(scratch).split_at_mut(len);
     *scratch = tail;
     head
+}
+
+/// The error of an array `what` that is not as long as it should be.
+pub(super) fn check(what: &str, have: usize, want: usize) -> Result<()> {
+    if have == want { Ok(()) } else { Err(Error::invalid(format!("{what} has {have} floats, expected {want}"))) }
 }

@@ -4,6 +4,7 @@ use super::top_view::PATH_WIDTH;
 use super::{Camera, Image, Mesh, Rgb, Shading, Stage, TopView, colour, film, ramp};
 use crate::body::{BETAS, BodyModel, FOOT_MARKERS, MARKER_DIM, PARAMS, ShapedBody, joint};
 use crate::motion::FPS;
+use crate::scene::Scene;
 use crate::{Error, Result};
 use glam::{Vec2, Vec3};
 
@@ -15,19 +16,6 @@ const STANCE_SPEED: f32 = 0.2;
 const HEAD_ROOM: f32 = 1.9;
 /// Colours of several people.
 const PEOPLE: [Rgb; 6] = [colour::BLUE, colour::ORANGE, colour::GREEN, colour::RED, [124, 84, 170], [70, 160, 170]];
-
-/// An upright box on the floor.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Block {
-    /// Middle in the plane, metres.
-    pub centre: Vec2,
-    /// Half sides before turning, metres.
-    pub half: Vec2,
-    /// Turn about z, radians.
-    pub yaw: f32,
-    /// Height, metres.
-    pub height: f32,
-}
 
 /// One person's part of an episode.
 #[derive(Clone, Copy, Debug)]
@@ -44,9 +32,8 @@ pub struct Walker<'a> {
 #[derive(Clone, Copy, Debug)]
 pub struct Episode<'a> {
     pub walkers: &'a [Walker<'a>],
-    pub blocks: &'a [Block],
-    /// The walkable polygon's outer ring and its holes.
-    pub rings: &'a [Vec<Vec2>],
+    /// Where it happens; for a changing scene, how it stood at one moment.
+    pub scene: &'a Scene,
     /// Distance within which a goal counts as reached, metres.
     pub reach: f32,
 }
@@ -67,7 +54,7 @@ impl<'a> Episode<'a> {
         let camera = self.camera(&tracks, width, height)?;
         let frames: Vec<_> = (0..count)
             .map(|i| {
-                let mut stage = self.scene();
+                let mut stage = self.stage();
                 let mut seconds = 0.0f32;
                 for (w, track) in tracks.iter().enumerate() {
                     let frame = moment(i, count, track.pelvis.len());
@@ -86,7 +73,7 @@ impl<'a> Episode<'a> {
     /// Errors as in [`Episode::panels`].
     pub fn ghosts(&self, model: &BodyModel, count: usize, width: usize, height: usize) -> Result<Image> {
         let tracks = self.tracks(model)?;
-        let mut stage = self.scene();
+        let mut stage = self.stage();
         for (w, track) in tracks.iter().enumerate() {
             for i in 0..count {
                 let shade =
@@ -103,14 +90,12 @@ impl<'a> Episode<'a> {
     /// Errors as in [`Episode::panels`].
     pub fn top_view(&self, model: &BodyModel, width: usize) -> Result<Image> {
         let tracks = self.tracks(model)?;
-        let blocks: Vec<Vec<Vec2>> = self.blocks.iter().map(Block::corners).collect();
-        let mut seen: Vec<Vec2> = self.rings.iter().chain(&blocks).flatten().copied().collect();
+        let (rings, boxes) = (self.rings(), self.boxes());
+        let mut seen: Vec<Vec2> = rings.iter().chain(&boxes).flatten().copied().collect();
         seen.extend(self.points(&tracks).map(|p| p.truncate()));
         let mut view = TopView::around(seen, 0.3, width)?;
-        if !self.rings.is_empty() {
-            view.polygon(self.rings, [226, 232, 224], colour::STONE);
-        }
-        blocks.iter().for_each(|b| view.polygon(std::slice::from_ref(b), colour::STONE, colour::INK));
+        view.polygon(&rings, [226, 232, 224], colour::STONE);
+        boxes.iter().for_each(|b| view.polygon(std::slice::from_ref(b), colour::STONE, colour::INK));
         for (w, track) in tracks.iter().enumerate() {
             let line: Vec<Vec2> = track.pelvis.iter().map(|p| p.truncate()).collect();
             track.stances().for_each(|(p, left)| view.dot(p, 2.0, if left { colour::BLUE } else { colour::RED }));
@@ -133,13 +118,23 @@ impl<'a> Episode<'a> {
         self.walkers.iter().enumerate().map(|(i, w)| Track::new(model, w).map_err(|e| Error::invalid(format!("walker {i}: {e}")))).collect()
     }
 
+    /// Rings of the walkable polygon.
+    fn rings(&self) -> Vec<Vec<Vec2>> {
+        self.scene.walkable.rings().map(|r| r.iter().map(|p| p.as_vec2()).collect()).collect()
+    }
+
+    /// Floor corners of the boxes.
+    fn boxes(&self) -> Vec<Vec<Vec2>> {
+        self.scene.obstacles.iter().map(|b| b.corners().map(|p| p.as_vec2()).to_vec()).collect()
+    }
+
     /// Boxes, the border of the walkable polygon and the goals.
-    fn scene(&self) -> Stage {
+    fn stage(&self) -> Stage {
         let mut stage = Stage::new();
-        for b in self.blocks {
-            stage.add(&Mesh::cuboid(b.centre, b.half, b.yaw, b.height), colour::STONE, Shading::Flat);
+        for b in &self.scene.obstacles {
+            stage.add(&Mesh::cuboid(b.centre, b.size / 2.0, b.yaw, b.height), colour::STONE, Shading::Flat);
         }
-        for ring in self.rings {
+        for ring in self.rings() {
             let border: Vec<Vec3> = ring.iter().chain(ring.first()).map(|p| p.extend(0.01)).collect();
             stage.add(&Mesh::tube(&border, 0.015), colour::INK, Shading::Smooth);
         }
@@ -152,7 +147,7 @@ impl<'a> Episode<'a> {
     /// Every point of the floor that a picture should show: the ways, the goals and the boxes.
     fn points<'b>(&'b self, tracks: &'b [Track]) -> impl Iterator<Item = Vec3> + 'b {
         let goals = self.walkers.iter().filter_map(|w| w.goal);
-        let floor = goals.chain(self.blocks.iter().flat_map(Block::corners)).map(|p| p.extend(0.0));
+        let floor = goals.chain(self.boxes().into_iter().flatten()).map(|p| p.extend(0.0));
         tracks.iter().flat_map(|t| t.pelvis.iter().map(|p| p.with_z(0.0))).chain(floor)
     }
 
@@ -179,14 +174,6 @@ impl<'a> Episode<'a> {
             }
             distance *= 1.08;
         }
-    }
-}
-
-impl Block {
-    /// Corners of the base, counter-clockwise.
-    fn corners(&self) -> Vec<Vec2> {
-        let (x, y) = (Vec2::from_angle(self.yaw) * self.half.x, Vec2::from_angle(self.yaw).perp() * self.half.y);
-        vec![self.centre - x - y, self.centre + x - y, self.centre + x + y, self.centre - x + y]
     }
 }
 
@@ -240,6 +227,7 @@ fn moment(i: usize, count: usize, frames: usize) -> usize {
 mod tests {
     use super::*;
     use crate::body::tests::toy;
+    use crate::scene::BoxObstacle;
 
     const BETAS_ZERO: [f32; BETAS] = [0.0; BETAS];
 
@@ -256,11 +244,11 @@ mod tests {
         let model = toy();
         let frames = straight(&model);
         let walkers = [Walker { frames: &frames, betas: &BETAS_ZERO, goal: Some(Vec2::new(3.0, 0.0)) }];
-        let blocks = [Block { centre: Vec2::new(1.0, -1.0), half: Vec2::new(0.4, 0.2), yaw: 0.5, height: 1.0 }];
-        let ring = vec![Vec2::new(-1.0, -2.0), Vec2::new(4.0, -2.0), Vec2::new(4.0, 2.0), Vec2::new(-1.0, 2.0)];
-        let episode = Episode { walkers: &walkers, blocks: &blocks, rings: std::slice::from_ref(&ring), reach: 0.1 };
+        let block = BoxObstacle { centre: Vec2::new(1.0, -1.0), size: Vec2::new(0.8, 0.4), yaw: 0.5, height: 1.0 };
+        let scene = Scene::with_boxes(4.0, vec![block]).unwrap();
+        let episode = Episode { walkers: &walkers, scene: &scene, reach: 0.1 };
         let image = episode.top_view(&model, 608).unwrap();
-        let view = TopView::around(ring, 0.3, 608).unwrap();
+        let view = TopView::around([Vec2::splat(-4.0), Vec2::splat(4.0)], 0.3, 608).unwrap();
         let pixel = |x: f32, y: f32| {
             let at = view.pixel(Vec2::new(x, y)).as_uvec2();
             image.pixel(at.x as usize, at.y as usize)
@@ -279,7 +267,7 @@ mod tests {
         let model = toy();
         let frames = straight(&model);
         let walkers = [Walker { frames: &frames, betas: &BETAS_ZERO, goal: None }];
-        let episode = Episode { walkers: &walkers, blocks: &[], rings: &[], reach: 0.1 };
+        let episode = Episode { walkers: &walkers, scene: &Scene::default(), reach: 0.1 };
         let sheet = episode.panels(&model, 3, 3, 60, 40).unwrap();
         assert_eq!((sheet.width, sheet.height), (3 * 60 + 2 * 4, 40));
         assert_eq!((moment(0, 3, 21), moment(1, 3, 21), moment(2, 3, 21), moment(0, 1, 1)), (0, 10, 20, 0));
@@ -313,11 +301,11 @@ mod tests {
         let model = toy();
         let draw = |frames: &[f32], betas: &[f32]| {
             let walkers = [Walker { frames, betas, goal: None }];
-            Episode { walkers: &walkers, blocks: &[], rings: &[], reach: 0.1 }.top_view(&model, 200).map_err(|e| e.to_string())
+            Episode { walkers: &walkers, scene: &Scene::default(), reach: 0.1 }.top_view(&model, 200).map_err(|e| e.to_string())
         };
         assert!(draw(&[0.0; 92], &BETAS_ZERO).unwrap_err().contains("93"));
         assert!(draw(&[], &BETAS_ZERO).is_err() && draw(&[0.0; 93], &[0.0; 9]).is_err());
         assert!(draw(&[f32::NAN; 93], &BETAS_ZERO).unwrap_err().contains("walker 0: frame 0"));
-        assert!(Episode { walkers: &[], blocks: &[], rings: &[], reach: 0.1 }.ghosts(&model, 3, 60, 40).is_err());
+        assert!(Episode { walkers: &[], scene: &Scene::default(), reach: 0.1 }.ghosts(&model, 3, 60, 40).is_err());
     }
 }

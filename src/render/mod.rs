@@ -13,7 +13,7 @@ mod top_view;
 
 pub use camera::Camera;
 pub use canvas::Canvas;
-pub use episode::{Block, Episode, Walker};
+pub use episode::{Episode, Walker};
 pub use film::{film, tile};
 pub use image::{Image, Rgb, ramp};
 pub use mesh::Mesh;

@@ -1,5 +1,6 @@
 //! How a policy sees and acts: observation layout, network, action distribution.
 
+pub mod bundle;
 mod gaussian;
 mod init;
 mod network;

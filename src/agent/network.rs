@@ -7,6 +7,7 @@ use super::spec::{Dense, Part, PolicySpec};
 use burn::tensor::activation::{relu, sigmoid, tanh};
 use burn::tensor::module::linear;
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
+use std::sync::Arc;
 
 /// Slope of the leaky ReLU below zero.
 pub const SLOPE: f32 = 0.01;
@@ -27,26 +28,36 @@ struct Layer {
 }
 
 /// A policy's weights on a device.
-pub struct Network<'a> {
-    spec: &'a PolicySpec,
+pub struct Network {
+    spec: Arc<PolicySpec>,
     layers: Vec<Layer>,
     device: Device,
 }
 
-impl<'a> Network<'a> {
-    /// Copies the flat parameters to `device`; with an autodiff device they are the leaves of gradients.
+impl Network {
+    /// Copies the flat parameters to `device`.
     ///
     /// # Panics
     /// When `flat` is not `spec.params()` long.
-    pub fn new(spec: &'a PolicySpec, flat: &[f32], device: &Device) -> Self {
+    pub fn new(spec: Arc<PolicySpec>, flat: &[f32], device: &Device) -> Self {
         assert_eq!(flat.len(), spec.params(), "parameters of another policy");
-        let leaf = |t: Tensor<2>| if device.is_autodiff() { t.require_grad() } else { t };
-        let leaf1 = |t: Tensor<1>| if device.is_autodiff() { t.require_grad() } else { t };
         let layer = |d: &Dense| Layer {
-            weight: leaf(Tensor::from_data(TensorData::new(d.weight_of(flat).to_vec(), [d.output, d.input]), device)),
-            bias: leaf1(Tensor::from_data(TensorData::new(d.bias_of(flat).to_vec(), [d.output]), device)),
+            weight: Tensor::from_data(TensorData::new(d.weight_of(flat).to_vec(), [d.output, d.input]), device),
+            bias: Tensor::from_data(TensorData::new(d.bias_of(flat).to_vec(), [d.output]), device),
         };
-        Self { spec, layers: spec.layers.iter().map(layer).collect(), device: device.clone() }
+        let layers = spec.layers.iter().map(layer).collect();
+        Self { spec, layers, device: device.clone() }
+    }
+
+    /// The same weights as leaves of a gradient graph of their own.
+    pub fn with_gradients(&self) -> Self {
+        let leaf = |l: &Layer| Layer { weight: l.weight.clone().autodiff().require_grad(), bias: l.bias.clone().autodiff().require_grad() };
+        Self { spec: self.spec.clone(), layers: self.layers.iter().map(leaf).collect(), device: self.device.clone().autodiff() }
+    }
+
+    /// The policy's sizes.
+    pub fn spec(&self) -> &PolicySpec {
+        &self.spec
     }
 
     /// The device the weights are on.

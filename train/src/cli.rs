@@ -1,0 +1,146 @@
+//! The program `train`.
+
+use crate::recipe::{EMBEDDED, Plan, Recipe, of_run};
+use crate::registry::Registry;
+use crate::trainer::{Outcome, Trainer, policy_spec};
+use crate::{Error, Result};
+use clap::Parser;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Exit code of a run that was interrupted and saved.
+const INTERRUPTED: u8 = 130;
+
+/// Trains a policy from a recipe.
+#[derive(Debug, Parser)]
+#[command(
+    name = "train",
+    version,
+    after_help = "Examples:
+  train                                   train the recipe `quick` into runs/quick
+  train point --set run.epochs=4          a recipe with a changed value
+  train my.toml --out runs/mine --seed 3  a recipe of your own
+  train --resume runs/mine                continue bit for bit where it stopped
+  train paper --dry-run                   show what would be done
+
+Exit codes: 0 done, 1 failed while running, 2 bad usage or recipe, 130 interrupted (after saving)."
+)]
+struct Args {
+    /// An embedded recipe (see --list) or a path ending in .toml
+    #[arg(default_value = "quick")]
+    recipe: String,
+    /// List the embedded recipes
+    #[arg(long)]
+    list: bool,
+    /// Show the resolved recipe and its size, train nothing
+    #[arg(long)]
+    dry_run: bool,
+    /// Folder of the run; must be new or empty [default: runs/<name>, numbered when taken]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Seed instead of the recipe's
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Change a value of the recipe, e.g. ppo.clip=0.2; repeatable
+    #[arg(long = "set", value_name = "KEY.PATH=VALUE")]
+    set: Vec<String>,
+    /// Continue the run in this folder; can change only run.epochs, checkpoint.* and test.*
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["recipe", "out", "seed", "list"])]
+    resume: Option<PathBuf>,
+    /// Threads to use; results do not depend on it [default: all cores]
+    #[arg(long)]
+    threads: Option<usize>,
+}
+
+/// Runs the program with the environments of `registry` and the process's arguments.
+pub fn run(registry: &Registry) -> ExitCode {
+    let args = match Args::try_parse() {
+        Ok(args) => args,
+        Err(e) => {
+            let _ = e.print();
+            return ExitCode::from(e.exit_code() as u8);
+        }
+    };
+    match act(&args, registry) {
+        Ok(code) => ExitCode::from(code),
+        Err(e) => {
+            eprintln!("error: {e}");
+            ExitCode::from(e.exit_code())
+        }
+    }
+}
+
+fn act(args: &Args, registry: &Registry) -> Result<u8> {
+    if args.list {
+        for (name, text) in EMBEDDED {
+            println!("{name:<8} {}", Recipe::parse(name, text, &[])?.about);
+        }
+        return Ok(0);
+    }
+    let mut recipe = match &args.resume {
+        Some(dir) => of_run(dir, &args.set)?,
+        None => Recipe::load(&args.recipe, &args.set)?,
+    };
+    recipe.seed = args.seed.unwrap_or(recipe.seed);
+    let plan = recipe.plan()?;
+    if args.dry_run {
+        return describe(&plan, registry);
+    }
+    let threads = start_threads(args.threads)?;
+    let mut trainer = match &args.resume {
+        Some(dir) => Trainer::resume(plan, registry, dir, threads, |what| eprintln!("warning: {what}"))?,
+        None => {
+            let dir = run_folder(args.out.as_deref(), &plan.recipe.name)?;
+            eprintln!("training '{}' into {}", plan.recipe.name, dir.display());
+            Trainer::start(plan, registry, &dir, threads)?
+        }
+    };
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = stop.clone();
+    ctrlc::set_handler(move || flag.store(true, Ordering::SeqCst)).map_err(|e| Error::run(format!("cannot watch for Ctrl-C: {e}")))?;
+    match trainer.run(&stop)? {
+        Outcome::Finished => Ok(0),
+        Outcome::Interrupted => {
+            eprintln!("interrupted and saved; `--resume` continues");
+            Ok(INTERRUPTED)
+        }
+    }
+}
+
+fn start_threads(wanted: Option<usize>) -> Result<usize> {
+    if wanted == Some(0) {
+        return Err(Error::config("--threads is 0, expected at least 1"));
+    }
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(wanted.unwrap_or(0));
+    pool.build_global().map_err(|e| Error::run(format!("cannot start threads: {e}")))?;
+    Ok(rayon::current_num_threads())
+}
+
+/// The given folder, which must be new or empty; or the first free one below `runs`.
+fn run_folder(given: Option<&Path>, name: &str) -> Result<PathBuf> {
+    let free = |dir: &Path| std::fs::read_dir(dir).map_or(!dir.exists(), |mut entries| entries.next().is_none());
+    match given {
+        Some(dir) if free(dir) => Ok(dir.into()),
+        Some(dir) => Err(Error::config(format!("--out {}: is not empty; give a new folder, or --resume to continue there", dir.display()))),
+        None => {
+            let numbered = (2..).map(|i| Path::new("runs").join(format!("{name}-{i}")));
+            let mut all = std::iter::once(Path::new("runs").join(name)).chain(numbered);
+            all.find(|dir| free(dir)).ok_or_else(|| Error::run("no free folder below runs"))
+        }
+    }
+}
+
+fn describe(plan: &Plan, registry: &Registry) -> Result<u8> {
+    let recipe = &plan.recipe;
+    let made = registry.make(&recipe.env, &recipe.env_options, 1)?;
+    let spec = policy_spec(plan, made.env.spec())?;
+    let per_epoch = plan.updates_per_epoch * recipe.run.collect_steps as u64;
+    println!("{}", recipe.to_toml()?);
+    println!("# observation: {} floats, action: {} floats", spec.layout.dim(), spec.action);
+    println!("# parameters: {}", spec.params());
+    println!("# updates: {} per epoch, each from {} environments x {} steps", plan.updates_per_epoch, recipe.run.envs, plan.horizon);
+    println!("# environment steps: {per_epoch} per epoch, {} in all", per_epoch * recipe.run.epochs);
+    Ok(0)
+}

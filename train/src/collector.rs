@@ -1,0 +1,214 @@
+//! Steps environments with the current policy and records what learning needs.
+
+use crate::actor::{Actor, Acts};
+use crate::{Error, Result};
+use egogen::agent::log_prob_of;
+use egogen::rng::stream;
+use egogen_envs::{StepResult, VecEnv};
+use rand_distr::{Distribution, StandardNormal};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// One finished episode.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Episode {
+    /// Sum of rewards.
+    pub total: f32,
+    /// Steps.
+    pub length: u32,
+    /// The environment's own figures, in the order of `EnvSpec::episode`.
+    pub figures: Vec<f32>,
+}
+
+/// What was recorded, time outermost: entry t x envs + i.
+#[derive(Clone, Debug, Default)]
+pub struct Rollout {
+    pub obs: Vec<f32>,
+    pub actions: Vec<f32>,
+    /// Log density of the actions at collection.
+    pub log_prob: Vec<f32>,
+    pub value: Vec<f32>,
+    /// Value after the step (of the final observation where truncated); 0 where terminated.
+    pub next_value: Vec<f32>,
+    pub reward: Vec<f32>,
+    pub terminated: Vec<bool>,
+    pub truncated: Vec<bool>,
+    /// Sums over all steps of the environment's per-step figures.
+    pub info: Vec<f64>,
+    /// Episodes that ended.
+    pub episodes: Vec<Episode>,
+}
+
+/// The environments with their current observations and running episodes.
+pub struct Collector {
+    env: Box<dyn VecEnv>,
+    seed: u64,
+    obs: Vec<f32>,
+    result: StepResult,
+    progress: Progress,
+}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Progress {
+    /// Vector steps so far; names the noise of the next.
+    steps: u64,
+    /// Return and length of each running episode.
+    running: Vec<(f32, u32)>,
+}
+
+impl Collector {
+    /// Resets the environments from `seed`, which also seeds the action noise.
+    pub fn new(mut env: Box<dyn VecEnv>, seed: u64) -> Result<Self> {
+        let mut obs = Vec::new();
+        env.reset(seed, &mut obs)?;
+        let progress = Progress { steps: 0, running: vec![(0.0, 0); env.num_envs()] };
+        Ok(Self { env, seed, obs, result: StepResult::default(), progress })
+    }
+
+    /// The environments.
+    pub fn env(&self) -> &dyn VecEnv {
+        self.env.as_ref()
+    }
+
+    /// Steps all environments `steps` times.
+    pub fn collect(&mut self, actor: &Actor, steps: usize) -> Result<Rollout> {
+        let envs = self.env.num_envs();
+        let mut out = Rollout { info: vec![0.0; self.env.spec().info.len()], ..Rollout::default() };
+        // Observations whose value the next step does not bring along: entry of the rollout and the observation.
+        let mut extra: (Vec<usize>, Vec<f32>) = Default::default();
+        for t in 0..steps {
+            let acts = actor.act(&self.obs);
+            let first = out.reward.len();
+            if t > 0 {
+                out.next_value[first - envs..].copy_from_slice(&acts.value);
+            }
+            self.record(&acts, &mut out);
+            let actions = out.actions.len() - acts.mu.len()..;
+            self.env.step(&out.actions[actions], &mut self.result)?;
+            self.take_result(&mut out)?;
+            let width = self.obs.len() / envs;
+            for i in 0..envs {
+                let cut = self.result.truncated[i] && !self.result.terminated[i];
+                let last = t + 1 == steps && !self.result.terminated[i];
+                if cut || last {
+                    extra.0.push(first + i);
+                    extra.1.extend_from_slice(&self.result.final_obs[i * width..(i + 1) * width]);
+                }
+            }
+            std::mem::swap(&mut self.obs, &mut self.result.obs);
+        }
+        let values = actor.values(&extra.1);
+        extra.0.iter().zip(values).for_each(|(&k, v)| out.next_value[k] = v);
+        for (v, end) in out.next_value.iter_mut().zip(&out.terminated) {
+            if *end {
+                *v = 0.0;
+            }
+        }
+        Ok(out)
+    }
+
+    /// Draws and records the actions for the current observations.
+    fn record(&mut self, acts: &Acts, out: &mut Rollout) {
+        let actions = acts.sample(self.seed, "actions", self.progress.steps);
+        let width = acts.mu.len() / acts.value.len();
+        let rows = acts.mu.chunks_exact(width).zip(acts.logvar.chunks_exact(width)).zip(actions.chunks_exact(width));
+        out.log_prob.extend(rows.map(|((m, v), a)| log_prob_of(m, v, a)));
+        out.obs.extend_from_slice(&self.obs);
+        out.actions.extend_from_slice(&actions);
+        out.value.extend_from_slice(&acts.value);
+        out.next_value.resize(out.value.len(), 0.0);
+    }
+
+    fn take_result(&mut self, out: &mut Rollout) -> Result<()> {
+        let result = &self.result;
+        check_finite("reward", &result.reward)?;
+        check_finite("observation", &result.obs)?;
+        out.reward.extend_from_slice(&result.reward);
+        out.terminated.extend_from_slice(&result.terminated);
+        out.truncated.extend_from_slice(&result.truncated);
+        for row in result.info.chunks_exact(out.info.len().max(1)) {
+            out.info.iter_mut().zip(row).for_each(|(sum, &x)| *sum += f64::from(x));
+        }
+        let figures = self.env.spec().episode.len();
+        for (i, running) in self.progress.running.iter_mut().enumerate() {
+            running.0 += result.reward[i];
+            running.1 += 1;
+            if result.terminated[i] || result.truncated[i] {
+                let (total, length) = std::mem::take(running);
+                out.episodes.push(Episode { total, length, figures: result.episode[i * figures..(i + 1) * figures].to_vec() });
+            }
+        }
+        self.progress.steps += 1;
+        Ok(())
+    }
+
+    /// The whole state: environments, running episodes, position in the noise.
+    pub fn save(&self) -> Result<Vec<u8>> {
+        let state = (self.env.save_state()?, &self.progress);
+        postcard::to_stdvec(&state).map_err(|e| Error::run(format!("cannot save the environments: {e}")))
+    }
+
+    /// Restores what `save` wrote for environments of the same kind and number.
+    pub fn load(&mut self, bytes: &[u8]) -> Result<()> {
+        let (env, progress): (Vec<u8>, Progress) =
+            postcard::from_bytes(bytes).map_err(|e| Error::run(format!("not a saved state of environments: {e}")))?;
+        if progress.running.len() != self.env.num_envs() {
+            return Err(Error::run(format!("saved {} environments, this run has {}", progress.running.len(), self.env.num_envs())));
+        }
+        self.env.load_state(&env)?;
+        self.env.observe(&mut self.obs)?;
+        self.progress = progress;
+        Ok(())
+    }
+}
+
+fn check_finite(what: &str, values: &[f32]) -> Result<()> {
+    match values.iter().position(|v| !v.is_finite()) {
+        Some(i) => Err(Error::run(format!("the environment returned {what} {} at entry {i}", values[i]))),
+        None => Ok(()),
+    }
+}
+
+impl Acts {
+    /// mean + sigma x noise, the noise of row i from stream (seed, purpose, step x rows + i).
+    pub fn sample(&self, seed: u64, purpose: &str, step: u64) -> Vec<f32> {
+        let rows = self.value.len();
+        let width = self.mu.len() / rows.max(1);
+        let mut out = self.mu.clone();
+        out.par_chunks_exact_mut(width).zip(self.logvar.par_chunks_exact(width)).enumerate().for_each(|(i, (row, logvar))| {
+            let noise = StandardNormal.sample_iter(stream(seed, purpose, step * rows as u64 + i as u64));
+            row.iter_mut().zip(logvar).zip(noise).for_each(|((a, v), e): (_, f32)| *a += (0.5 * v).exp() * e);
+        });
+        out
+    }
+}
+
+/// The first episode of every environment after a reset from `seed`; with the policy's noise or with its mean alone.
+pub fn test_episodes(env: &mut dyn VecEnv, actor: &Actor, seed: u64, noise: bool) -> Result<Vec<Episode>> {
+    let (envs, figures) = (env.num_envs(), env.spec().episode.len());
+    let (mut obs, mut result) = (Vec::new(), StepResult::default());
+    let mut running = vec![(0.0, 0); envs];
+    let mut done: Vec<Option<Episode>> = vec![None; envs];
+    env.reset(seed, &mut obs)?;
+    for step in 0.. {
+        let acts = actor.act(&obs);
+        let actions = if noise { acts.sample(seed, "test actions", step) } else { acts.mu };
+        env.step(&actions, &mut result)?;
+        for i in (0..envs).filter(|&i| done[i].is_none()).collect::<Vec<_>>() {
+            running[i].0 += result.reward[i];
+            running[i].1 += 1;
+            if result.terminated[i] || result.truncated[i] {
+                let (total, length) = running[i];
+                done[i] = Some(Episode { total, length, figures: result.episode[i * figures..(i + 1) * figures].to_vec() });
+            }
+        }
+        if done.iter().all(Option::is_some) || step >= MAX_TEST_STEPS {
+            break;
+        }
+        std::mem::swap(&mut obs, &mut result.obs);
+    }
+    Ok(done.into_iter().flatten().collect())
+}
+
+/// Episodes longer than this do not count in tests.
+const MAX_TEST_STEPS: u64 = 10_000;

@@ -1,0 +1,218 @@
+//! Recipes: what a person can train, as TOML; checked once into a [`Plan`].
+
+use crate::{AdamConfig, Error, PpoConfig, Result};
+use egogen::agent::PolicyConfig;
+use egogen::device::DeviceChoice;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// The recipes that come with the program: file stem and content.
+pub const EMBEDDED: [(&str, &str); 3] = [
+    ("quick", include_str!("../recipes/quick.toml")),
+    ("paper", include_str!("../recipes/paper.toml")),
+    ("point", include_str!("../recipes/point.toml")),
+];
+
+/// A recipe as written.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// Names the run folder.
+    pub name: String,
+    /// One line for `train --list`.
+    pub about: String,
+    /// Name of a registered environment.
+    pub env: String,
+    /// Seeds weights, environments, noise and shuffles.
+    pub seed: u64,
+    /// Where the networks compute.
+    #[serde(default)]
+    pub device: DeviceChoice,
+    /// How much is trained.
+    pub run: RunConfig,
+    /// Sizes of the policy.
+    pub policy: PolicyConfig,
+    /// The loss.
+    pub ppo: PpoConfig,
+    /// The optimiser.
+    pub adam: AdamConfig,
+    /// Test episodes between epochs.
+    pub test: TestConfig,
+    /// What is kept.
+    pub checkpoint: CheckpointConfig,
+    /// Options of the environment, checked by its factory.
+    #[serde(default)]
+    pub env_options: toml::Table,
+}
+
+/// How much is trained.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RunConfig {
+    /// Epochs; metrics are reported once in each.
+    pub epochs: u64,
+    /// Environment steps per epoch, rounded up to whole collections.
+    pub epoch_steps: usize,
+    /// Environments stepped together.
+    pub envs: usize,
+    /// Environment steps per collection, over all environments; an update follows each.
+    pub collect_steps: usize,
+    /// Pieces into which batches are split, one thread each; results depend on it, so it does not follow the machine.
+    pub shards: usize,
+}
+
+/// Test episodes: the same starts every time.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TestConfig {
+    /// Episodes with the policy's noise, and as many with its mean action.
+    pub episodes: usize,
+    /// Epochs between tests; the last epoch is always tested.
+    pub every: u64,
+    /// Seed of the starts.
+    pub seed: u64,
+}
+
+/// What is kept of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CheckpointConfig {
+    /// Epochs between checkpoints; tested epochs should have one.
+    pub every: u64,
+    /// Newest checkpoints kept beside the best one.
+    pub keep: usize,
+    /// The figure of metrics.csv that makes a checkpoint the best; larger is better.
+    pub best: String,
+    /// Checkpoints whose loss/kl_prior is above this cannot be the best: their actions left what the motion model knows.
+    #[serde(default)]
+    pub max_kl_prior: Option<f64>,
+}
+
+/// A checked recipe.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Plan {
+    /// The recipe it came from.
+    pub recipe: Recipe,
+    /// Steps of every environment per collection.
+    pub horizon: usize,
+    /// Collections (and updates) per epoch.
+    pub updates_per_epoch: u64,
+}
+
+impl Recipe {
+    /// The embedded recipe `name` or the file at that path, with `key.path=value` changes.
+    pub fn load(name: &str, changes: &[String]) -> Result<Self> {
+        let embedded = EMBEDDED.iter().find(|(n, _)| *n == name);
+        let (origin, text) = match embedded {
+            Some((_, text)) => (format!("recipe '{name}'"), text.to_string()),
+            None if name.ends_with(".toml") => {
+                (name.to_string(), std::fs::read_to_string(name).map_err(|e| Error::config(format!("{name}: {e}")))?)
+            }
+            None => {
+                let known: Vec<_> = EMBEDDED.iter().map(|(n, _)| *n).collect();
+                return Err(Error::config(format!("no recipe '{name}': expected {} or a path ending in .toml", known.join(", "))));
+            }
+        };
+        Self::parse(&origin, &text, changes)
+    }
+
+    /// Parses TOML; `origin` names it in errors.
+    pub fn parse(origin: &str, text: &str, changes: &[String]) -> Result<Self> {
+        let bad = |e: toml::de::Error| Error::config(format!("{origin}: {}", e.to_string().trim_end()));
+        let recipe: Self = toml::from_str(text).map_err(bad)?;
+        if changes.is_empty() {
+            return Ok(recipe);
+        }
+        let mut table: toml::Table = toml::from_str(text).map_err(bad)?;
+        for change in changes {
+            set(&mut table, change)?;
+        }
+        let text = toml::to_string(&table).map_err(|e| Error::config(format!("{origin}: {e}")))?;
+        toml::from_str(&text)
+            .map_err(|e| Error::config(format!("{origin} with --set {}: {}", changes.join(" --set "), e.to_string().trim_end())))
+    }
+
+    /// The recipe as TOML.
+    pub fn to_toml(&self) -> Result<String> {
+        toml::to_string(self).map_err(|e| Error::run(format!("cannot write the recipe: {e}")))
+    }
+
+    /// Checks every value.
+    pub fn plan(self) -> Result<Plan> {
+        let run = &self.run;
+        let positive = [
+            ("run.epoch_steps", run.epoch_steps),
+            ("run.envs", run.envs),
+            ("run.collect_steps", run.collect_steps),
+            ("run.shards", run.shards),
+            ("ppo.batch", self.ppo.batch),
+            ("ppo.passes", self.ppo.passes),
+            ("test.episodes", self.test.episodes),
+            ("test.every", self.test.every as usize),
+            ("checkpoint.every", self.checkpoint.every as usize),
+            ("checkpoint.keep", self.checkpoint.keep),
+        ];
+        for (key, value) in positive {
+            self.expect(key, value, value > 0, "at least 1")?;
+        }
+        self.expect("run.shards", run.shards, run.shards <= 64, "at most 64")?;
+        let whole = run.collect_steps % run.envs == 0;
+        self.expect("run.collect_steps", run.collect_steps, whole, &format!("a multiple of run.envs = {}", run.envs))?;
+        let whole = run.collect_steps % self.ppo.batch == 0;
+        self.expect("ppo.batch", self.ppo.batch, whole, &format!("a divisor of run.collect_steps = {}", run.collect_steps))?;
+        let (ppo, adam) = (&self.ppo, &self.adam);
+        for (key, value) in [("ppo.gamma", ppo.gamma), ("ppo.lambda", ppo.lambda)] {
+            self.expect(key, value, (0.0..=1.0).contains(&value), "0 to 1")?;
+        }
+        self.expect("ppo.clip", ppo.clip, ppo.clip > 0.0 && ppo.clip < 1.0, "between 0 and 1")?;
+        for (key, value) in [("ppo.max_grad_norm", ppo.max_grad_norm), ("adam.lr", adam.lr), ("adam.eps", adam.eps)] {
+            self.expect(key, value, value > 0.0 && value.is_finite(), "a number above 0")?;
+        }
+        let weights = [("ppo.value", ppo.value), ("ppo.entropy", ppo.entropy), ("ppo.kl_prior", ppo.kl_prior)];
+        for (key, value) in weights.into_iter().chain([("adam.weight_decay", adam.weight_decay)]) {
+            self.expect(key, value, value >= 0.0 && value.is_finite(), "0 or more")?;
+        }
+        for beta in adam.betas {
+            self.expect("adam.betas", beta, (0.0..1.0).contains(&beta), "0 to below 1")?;
+        }
+        let plain = |c: char| c.is_ascii_alphanumeric() || "-_".contains(c);
+        self.expect("name", &self.name, !self.name.is_empty() && self.name.chars().all(plain), "letters, digits, - and _")?;
+        let horizon = run.collect_steps / run.envs;
+        let updates_per_epoch = run.epoch_steps.div_ceil(run.collect_steps) as u64;
+        Ok(Plan { horizon, updates_per_epoch, recipe: self })
+    }
+
+    fn expect(&self, key: &str, value: impl std::fmt::Display, holds: bool, want: &str) -> Result<()> {
+        if holds { Ok(()) } else { Err(Error::config(format!("recipe '{}': {key} is {value}, expected {want}", self.name))) }
+    }
+}
+
+/// Applies one `key.path=value`; the value is TOML, or a plain string where it is not.
+fn set(table: &mut toml::Table, change: &str) -> Result<()> {
+    let Some((path, value)) = change.split_once('=') else {
+        return Err(Error::config(format!("--set {change}: expected key.path=value")));
+    };
+    let parsed = toml::from_str::<toml::Table>(&format!("v = {value}")).ok().and_then(|mut t| t.remove("v"));
+    let value = parsed.unwrap_or_else(|| toml::Value::String(value.into()));
+    let keys: Vec<&str> = path.trim().split('.').collect();
+    let (last, parents) = keys.split_last().expect("split yields one part");
+    let mut at = table;
+    for key in parents {
+        let next = at.entry(*key).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+        at = next.as_table_mut().ok_or_else(|| Error::config(format!("--set {change}: '{key}' is a value, not a table")))?;
+    }
+    at.insert(last.to_string(), value);
+    Ok(())
+}
+
+/// Reads the resolved recipe of the run in `dir`, with changes that a continued run may make.
+pub fn of_run(dir: &Path, changes: &[String]) -> Result<Recipe> {
+    const MAY: [&str; 3] = ["run.epochs", "checkpoint.", "test."];
+    if let Some(change) = changes.iter().find(|c| !MAY.iter().any(|m| c.starts_with(m))) {
+        return Err(Error::config(format!("--set {change}: a continued run can change only run.epochs, checkpoint.* and test.*")));
+    }
+    let path = dir.join("recipe.toml");
+    let origin = path.display().to_string();
+    let text = std::fs::read_to_string(&path).map_err(|e| Error::config(format!("{origin}: {e}: not a run folder")))?;
+    Recipe::parse(&origin, &text, changes)
+}

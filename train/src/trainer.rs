@@ -1,0 +1,288 @@
+//! The run: collect, update, report, test, save; from the start or from a checkpoint.
+
+use crate::checkpoint::{self, Best, Checkpoint, Description, State};
+use crate::collector::{Collector, test_episodes};
+use crate::logger::{Console, Csv, Logger, TensorBoard};
+use crate::ppo::Learner;
+use crate::recipe::Plan;
+use crate::registry::Registry;
+use crate::shards::Shards;
+use crate::stats::{Episodes, EpochStats, Row};
+use crate::{AdamW, Error, Result};
+use egogen::agent::{ObsGroup, ObsLayout, PolicySpec, bundle};
+use egogen::io::write_atomic;
+use egogen_envs::{ActionSpace, EnvSpec, VecEnv};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// How a run ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// All epochs are done.
+    Finished,
+    /// Stopped from outside, after saving.
+    Interrupted,
+}
+
+/// A run in its folder.
+pub struct Trainer {
+    plan: Plan,
+    dir: PathBuf,
+    origin: BTreeMap<String, String>,
+    env_spec: EnvSpec,
+    collector: Collector,
+    test_env: Box<dyn VecEnv>,
+    learner: Learner,
+    epoch: u64,
+    env_steps: u64,
+    stats: EpochStats,
+    best: Option<Best>,
+    last_test: BTreeMap<String, f64>,
+}
+
+/// The policy that a plan trains in these environments.
+pub fn policy_spec(plan: &Plan, env: &EnvSpec) -> Result<PolicySpec> {
+    let ActionSpace::Continuous(action) = env.action else {
+        return Err(Error::config(format!("env '{}' has discrete actions; PPO here draws continuous ones", plan.recipe.env)));
+    };
+    let groups = env.obs.iter().map(|g| ObsGroup { name: g.name.clone(), shape: g.shape.clone() }).collect();
+    PolicySpec::new(plan.recipe.policy.clone(), ObsLayout::new(groups), action)
+        .map_err(|e| Error::config(format!("recipe '{}': {e}", plan.recipe.name)))
+}
+
+impl Trainer {
+    /// Starts a run in the new folder `dir`.
+    pub fn start(plan: Plan, registry: &Registry, dir: &Path, threads: usize) -> Result<Self> {
+        write_atomic(dir.join("recipe.toml"), plan.recipe.to_toml()?.as_bytes())?;
+        Self::build(plan, registry, dir, threads, None)
+    }
+
+    /// Continues the run in `dir` from its newest whole checkpoint.
+    pub fn resume(plan: Plan, registry: &Registry, dir: &Path, threads: usize, warn: impl FnMut(String)) -> Result<Self> {
+        let from = checkpoint::newest(&dir.join("checkpoints"), warn)?;
+        write_atomic(dir.join("recipe.toml"), plan.recipe.to_toml()?.as_bytes())?;
+        Self::build(plan, registry, dir, threads, Some(from))
+    }
+
+    fn build(plan: Plan, registry: &Registry, dir: &Path, threads: usize, from: Option<Checkpoint>) -> Result<Self> {
+        let recipe = &plan.recipe;
+        let made = registry.make(&recipe.env, &recipe.env_options, recipe.run.envs)?;
+        let test_env = registry.make(&recipe.env, &recipe.env_options, recipe.test.episodes)?.env;
+        let env_spec = made.env.spec().clone();
+        let spec = Arc::new(policy_spec(&plan, &env_spec)?);
+        let mut collector = Collector::new(made.env, recipe.seed)?;
+        let (params, adam, state) = match from {
+            None => (spec.init(recipe.seed), AdamW::new(spec.params()), State::default()),
+            Some(c) => {
+                check_same(&c.description, &spec, &made.origin)?;
+                collector.load(&c.state.collector)?;
+                (c.params, c.adam, c.state)
+            }
+        };
+        let device = recipe.device.device()?;
+        let shards = Shards::new(recipe.run.shards, threads)?;
+        Ok(Self {
+            learner: Learner::new(spec, device, shards, params, adam, state.updates),
+            dir: dir.into(),
+            origin: made.origin,
+            env_spec,
+            collector,
+            test_env,
+            epoch: state.epoch,
+            env_steps: state.env_steps,
+            stats: state.stats,
+            best: state.best,
+            last_test: BTreeMap::new(),
+            plan,
+        })
+    }
+
+    /// Trains until all epochs are done or `stop` is set; saves either way. A finished run leaves `policy/` and `summary.json`.
+    pub fn run(&mut self, stop: &AtomicBool) -> Result<Outcome> {
+        let epochs = self.plan.recipe.run.epochs;
+        let per_epoch = self.plan.updates_per_epoch;
+        let console = Console::new(epochs, epochs * per_epoch, self.learner.updates());
+        let mut metrics: [Box<dyn Logger>; 2] =
+            [Box::new(Csv::open(&self.dir.join("metrics.csv"), self.epoch)?), Box::new(TensorBoard::new(&self.dir.join("tensorboard")))];
+        let mut timing = Csv::open(&self.dir.join("timing.csv"), self.epoch)?;
+        let mut row = Row::new();
+        while self.epoch < epochs {
+            let mut clock = Clock::default();
+            let begun = self.stats.updates;
+            while self.stats.updates < per_epoch {
+                self.update(&mut clock)?;
+                console.tick();
+                if stop.load(Ordering::SeqCst) && self.stats.updates < per_epoch {
+                    self.save()?;
+                    return Ok(Outcome::Interrupted);
+                }
+            }
+            let steps = (per_epoch - begun) * self.plan.recipe.run.collect_steps as u64;
+            row = self.finish_epoch(&mut clock)?;
+            metrics.iter_mut().try_for_each(|m| m.log(self.epoch, &row))?;
+            timing.log(self.epoch, &clock.row(steps))?;
+            let rate = steps as f64 / clock.total();
+            let left = (epochs - self.epoch) as f64 * per_epoch as f64 * self.plan.recipe.run.collect_steps as f64 / rate;
+            console.epoch(self.epoch, &row, rate, left);
+            if self.epoch % self.plan.recipe.checkpoint.every == 0 || self.epoch == epochs || stop.load(Ordering::SeqCst) {
+                self.select(&row);
+                self.save()?;
+            }
+            if stop.load(Ordering::SeqCst) && self.epoch < epochs {
+                return Ok(Outcome::Interrupted);
+            }
+        }
+        self.finish(&row)?;
+        Ok(Outcome::Finished)
+    }
+
+    /// One collection and one update.
+    fn update(&mut self, clock: &mut Clock) -> Result<()> {
+        let recipe = &self.plan.recipe;
+        let start = Instant::now();
+        let rollout = self.collector.collect(&self.learner.actor(), self.plan.horizon)?;
+        clock.collect += start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let update = self.learner.update(&rollout, recipe.run.envs, &recipe.ppo, &recipe.adam, recipe.seed)?;
+        clock.learn += start.elapsed().as_secs_f64();
+        self.env_steps += rollout.reward.len() as u64;
+        self.stats.add(&rollout, &update);
+        Ok(())
+    }
+
+    /// Counts the epoch, tests where it is due, and gives its figures.
+    fn finish_epoch(&mut self, clock: &mut Clock) -> Result<Row> {
+        self.epoch += 1;
+        let mut row: Row = vec![("updates".into(), Some(self.learner.updates() as f64)), ("env_steps".into(), Some(self.env_steps as f64))];
+        row.extend(std::mem::take(&mut self.stats).row(&self.env_spec));
+        let test = &self.plan.recipe.test;
+        let due = self.epoch % test.every == 0 || self.epoch == self.plan.recipe.run.epochs;
+        let start = Instant::now();
+        for (prefix, noise) in [("test_sto", true), ("test_det", false)] {
+            let mut episodes = Episodes::default();
+            if due {
+                episodes.add(&test_episodes(self.test_env.as_mut(), &self.learner.actor(), test.seed, noise)?);
+            }
+            row.extend(episodes.row(prefix, &self.env_spec));
+        }
+        clock.test = start.elapsed().as_secs_f64();
+        if due {
+            let tested = row.iter().filter(|(n, _)| n.starts_with("test_"));
+            self.last_test = tested.filter_map(|(n, v)| v.map(|v| (n.clone(), v))).collect();
+        }
+        Ok(row)
+    }
+
+    /// Notes the checkpoint about to be written when it is the best so far.
+    fn select(&mut self, row: &Row) {
+        let rule = &self.plan.recipe.checkpoint;
+        let get = |name: &str| row.iter().find(|(n, _)| n == name).and_then(|(_, v)| *v);
+        let allowed = rule.max_kl_prior.is_none_or(|max| get("loss/kl_prior").is_some_and(|kl| kl <= max));
+        let Some(value) = get(&rule.best).filter(|_| allowed) else { return };
+        if self.best.as_ref().is_none_or(|b| value >= b.value) {
+            self.best = Some(Best { name: format!("epoch-{:04}", self.epoch), value });
+        }
+    }
+
+    fn save(&self) -> Result<()> {
+        let spec = self.learner.spec();
+        let checkpoint = Checkpoint {
+            description: Description {
+                format: Description::FORMAT,
+                recipe: self.plan.recipe.name.clone(),
+                seed: self.plan.recipe.seed,
+                epoch: self.epoch,
+                env_steps: self.env_steps,
+                layout: spec.layout.clone(),
+                policy: spec.config.clone(),
+                action: spec.action,
+                origin: self.origin.clone(),
+                test: self.last_test.clone(),
+                files: BTreeMap::new(),
+            },
+            params: self.learner.params().to_vec(),
+            adam: self.learner.adam().clone(),
+            state: State {
+                epoch: self.epoch,
+                updates: self.learner.updates(),
+                env_steps: self.env_steps,
+                adam_steps: self.learner.adam().steps,
+                best: self.best.clone(),
+                stats: self.stats.clone(),
+                collector: self.collector.save()?,
+            },
+        };
+        let root = self.dir.join("checkpoints");
+        checkpoint.write(&root, spec)?;
+        checkpoint::prune(&root, self.plan.recipe.checkpoint.keep, self.best.as_ref())
+    }
+
+    /// Packs the best policy (the last one where no test chose any) and sums the run up.
+    fn finish(&self, row: &Row) -> Result<()> {
+        let root = self.dir.join("checkpoints");
+        let last = checkpoint::list(&root).pop().ok_or_else(|| Error::run("the run wrote no checkpoint"))?;
+        let chosen = self.best.as_ref().map_or(last, |b| b.name.clone());
+        export(&root.join(&chosen), &self.dir.join("policy"))?;
+        let figures: BTreeMap<_, _> = row.iter().filter_map(|(n, v)| v.map(|v| (n, v))).collect();
+        let summary = serde_json::json!({
+            "recipe": self.plan.recipe.name,
+            "seed": self.plan.recipe.seed,
+            "version": env!("CARGO_PKG_VERSION"),
+            "epochs": self.epoch,
+            "env_steps": self.env_steps,
+            "parameters": self.learner.params().len(),
+            "policy": chosen,
+            "best": self.best,
+            "last_epoch": figures,
+        });
+        let text = serde_json::to_string_pretty(&summary).map_err(|e| Error::run(format!("cannot write the summary: {e}")))?;
+        Ok(write_atomic(self.dir.join("summary.json"), text.as_bytes())?)
+    }
+}
+
+/// Packs the policy of the checkpoint folder `from` into the bundle folder `to`.
+pub fn export(from: &Path, to: &Path) -> Result<()> {
+    let (d, spec, params) = Checkpoint::read_policy(from)?;
+    let trained = bundle::Trained { recipe: d.recipe, seed: d.seed, epoch: d.epoch, env_steps: d.env_steps, test: d.test };
+    Ok(bundle::Bundle::new(spec, &params, d.origin, trained)?.write(to)?)
+}
+
+fn check_same(d: &Description, spec: &PolicySpec, origin: &BTreeMap<String, String>) -> Result<()> {
+    if d.layout != spec.layout || d.policy != spec.config || d.action != spec.action {
+        return Err(Error::config("the run's checkpoints hold a policy of other sizes than its recipe and environment ask for"));
+    }
+    match origin.iter().find(|(name, hash)| d.origin.get(*name) != Some(hash)) {
+        Some((name, hash)) => {
+            let was = d.origin.get(name).map_or("nothing", String::as_str);
+            Err(Error::config(format!("the run was trained on {name} {was}, but {name} {hash} is here now")))
+        }
+        None => Ok(()),
+    }
+}
+
+/// Wall-clock seconds of an epoch.
+#[derive(Default)]
+struct Clock {
+    collect: f64,
+    learn: f64,
+    test: f64,
+}
+
+impl Clock {
+    fn total(&self) -> f64 {
+        self.collect + self.learn + self.test
+    }
+
+    fn row(&self, steps: u64) -> Row {
+        let figures = [
+            ("steps_per_second", steps as f64 / self.total()),
+            ("collect_seconds", self.collect),
+            ("learn_seconds", self.learn),
+            ("test_seconds", self.test),
+        ];
+        figures.into_iter().map(|(n, v)| (n.to_string(), Some(v))).collect()
+    }
+}

@@ -152,8 +152,8 @@ fn adjoint_matches_differences() {
     // The markers are linear in each single entry, so a large step has no truncation error.
     let h = 0.5f32;
     let mut largest = 0.0f64;
-    for k in 0..BODY_JOINTS {
-        for e in 0..9 {
+    for (k, gradients) in g_rot.iter().enumerate() {
+        for (e, &g) in gradients.iter().enumerate() {
             let mut at = |d: f32| {
                 local[k].col_mut(e % 3)[e / 3] += d;
                 let value = weighted(&body, &local, transl, &grad);
@@ -161,7 +161,7 @@ fn adjoint_matches_differences() {
                 value
             };
             let difference = (at(h) - at(-h)) / (2.0 * h as f64);
-            assert!((difference - g_rot[k][e] as f64).abs() < 2e-4, "joint {k} entry {e}: {difference} {}", g_rot[k][e]);
+            assert!((difference - g as f64).abs() < 2e-4, "joint {k} entry {e}: {difference} {g}");
             largest = largest.max(difference.abs());
         }
     }

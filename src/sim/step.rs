@@ -1,0 +1,163 @@
+//! One step of the simulated people: a primitive of 20 frames from two seed frames and a latent.
+
+use super::people::{JOINT_DIM, PersonMut};
+use super::{People, Primitives};
+use crate::body::{BETAS, BodyModel, MARKER_DIM, PARAMS, POSE, ShapedBody};
+use crate::motion::{FRAMES, FUTURE, MotionModel, SEED};
+use crate::{Error, Result};
+use rayon::prelude::*;
+use std::sync::{Arc, Mutex};
+
+/// Fewest people that one task works on.
+const CHUNK: usize = 4;
+
+/// The world's people: a body and the motion model that moves it.
+pub struct Sim {
+    body: Arc<BodyModel>,
+    model: Arc<dyn MotionModel>,
+    /// Buffers between steps; a step takes one and puts it back, so steps may run side by side.
+    spare: Mutex<Vec<Buffers>>,
+}
+
+/// What the motion model reads and writes in one step.
+#[derive(Default)]
+struct Buffers {
+    /// n x 18 x 10.
+    betas: Vec<f32>,
+    /// n x 18 x 201.
+    predicted: Vec<f32>,
+    /// n x 18 x 93.
+    regressed: Vec<f32>,
+}
+
+impl Sim {
+    /// People with `body`, moved by `model`.
+    pub fn new(body: Arc<BodyModel>, model: Arc<dyn MotionModel>) -> Self {
+        Self { body, model, spare: Mutex::default() }
+    }
+
+    /// The body everybody has, up to shape.
+    pub fn body(&self) -> &Arc<BodyModel> {
+        &self.body
+    }
+
+    /// The motion model.
+    pub fn model(&self) -> &Arc<dyn MotionModel> {
+        &self.model
+    }
+
+    /// Moves everybody by one primitive of 20 frames, 18 of them new. `latents`: n x latent_dim.
+    ///
+    /// 1. Decode 18 frames of markers, regress their bodies, prepend the 2 seed bodies.
+    /// 2. Smooth the seam: of frames 2 and 3 (from 0), parameters from index 6 on become the mean of their two neighbours,
+    ///    both from the values before smoothing.
+    /// 3. New markers = 0.5 x skinned + 0.5 x predicted.
+    /// 4. The last two frames, in the canonical frame of the first of them, become the next seed in `people`.
+    ///
+    /// Sizes that do not fit and results that are not finite are refused (naming the person), with `people` as they were.
+    pub fn step(&self, people: &mut People, latents: &[f32], out: &mut Primitives) -> Result<()> {
+        people.check()?;
+        let (n, dim) = (people.len(), self.model.latent_dim());
+        if latents.len() != n * dim {
+            return Err(Error::invalid(format!("{} latent floats for {n} people, expected {n} x {dim}", latents.len())));
+        }
+        all_finite("latents", latents, dim)?;
+        let mut buffers = self.spare.lock().map(|mut s| s.pop().unwrap_or_default()).unwrap_or_default();
+        let done = self.predict(people, latents, &mut buffers).and_then(|()| {
+            self.fill(people, &buffers, out);
+            all_finite("markers", &out.markers, FRAMES * MARKER_DIM)?;
+            all_finite("bodies", &out.params, FRAMES * PARAMS)?;
+            all_finite("joints", &out.joints, FRAMES * JOINT_DIM)
+        });
+        if let Ok(mut spare) = self.spare.lock() {
+            spare.push(buffers);
+        }
+        done?;
+        self.advance(people, out);
+        Ok(())
+    }
+
+    fn predict(&self, people: &People, latents: &[f32], b: &mut Buffers) -> Result<()> {
+        let frames = people.len() * FUTURE;
+        b.predicted.resize(frames * MARKER_DIM, 0.0);
+        b.regressed.resize(frames * PARAMS, 0.0);
+        b.betas.clear();
+        b.betas.extend(people.betas.chunks_exact(BETAS).flat_map(|betas| std::iter::repeat_n(betas, FUTURE)).flatten());
+        self.model.decode(&people.markers, latents, &mut b.predicted)?;
+        all_finite("predicted markers", &b.predicted, FUTURE * MARKER_DIM)?;
+        self.model.regress(&b.predicted, &b.betas, &mut b.regressed)
+    }
+
+    fn fill(&self, people: &People, b: &Buffers, out: &mut Primitives) {
+        out.resize(people.len());
+        out.frames.copy_from_slice(&people.frames);
+        let parts = (
+            out.markers.par_chunks_exact_mut(FRAMES * MARKER_DIM),
+            out.params.par_chunks_exact_mut(FRAMES * PARAMS),
+            out.joints.par_chunks_exact_mut(FRAMES * JOINT_DIM),
+            out.views.par_chunks_exact_mut(FRAMES * 3),
+        );
+        parts.into_par_iter().with_min_len(CHUNK).enumerate().for_each(|(i, (markers, params, joints, views))| {
+            let body = self.body.shape(&people.betas[i * BETAS..][..BETAS]);
+            let (old, new) = params.split_at_mut(SEED * PARAMS);
+            old.copy_from_slice(&people.params[i * SEED * PARAMS..][..SEED * PARAMS]);
+            new.copy_from_slice(&b.regressed[i * FUTURE * PARAMS..][..FUTURE * PARAMS]);
+            smooth_seam(params);
+            let (old, new) = markers.split_at_mut(SEED * MARKER_DIM);
+            old.copy_from_slice(&people.markers[i * SEED * MARKER_DIM..][..SEED * MARKER_DIM]);
+            pose_frames(&body, params, new, joints, views);
+            for (m, p) in new.iter_mut().zip(&b.predicted[i * FUTURE * MARKER_DIM..]) {
+                *m = 0.5 * (*m + p);
+            }
+        });
+    }
+
+    fn advance(&self, people: &mut People, out: &Primitives) {
+        let parts = (
+            people.frames.par_iter_mut(),
+            people.markers.par_chunks_exact_mut(SEED * MARKER_DIM),
+            people.params.par_chunks_exact_mut(SEED * PARAMS),
+            people.joints.par_chunks_exact_mut(SEED * JOINT_DIM),
+            people.views.par_chunks_exact_mut(SEED * 3),
+        );
+        let betas = &people.betas;
+        parts.into_par_iter().with_min_len(CHUNK).enumerate().for_each(|(i, (frame, markers, params, joints, views))| {
+            let body = self.body.shape(&betas[i * BETAS..][..BETAS]);
+            let last = i * FRAMES + FUTURE;
+            let mut person = PersonMut { frame, markers, params, joints, views };
+            person.reseed(&body, &out.params[last * PARAMS..][..SEED * PARAMS], &out.markers[last * MARKER_DIM..][..SEED * MARKER_DIM]);
+        });
+    }
+}
+
+/// Joints and views of all 20 frames, skinned markers of the 18 new ones.
+fn pose_frames(body: &ShapedBody, params: &[f32], new_markers: &mut [f32], joints: &mut [f32], views: &mut [f32]) {
+    for (t, frame) in params.chunks_exact(PARAMS).enumerate() {
+        let posed = body.pose(frame);
+        posed.write_joints(&mut joints[t * JOINT_DIM..][..JOINT_DIM]);
+        views[3 * t..][..3].copy_from_slice(&posed.view().to_array());
+        if t >= SEED {
+            body.markers(&posed, &mut new_markers[(t - SEED) * MARKER_DIM..][..MARKER_DIM]);
+        }
+    }
+}
+
+fn smooth_seam(params: &mut [f32]) {
+    for k in POSE.start..PARAMS {
+        let at = |t: usize| params[t * PARAMS + k];
+        let (second, third) = (0.5 * (at(1) + at(3)), 0.5 * (at(2) + at(4)));
+        params[2 * PARAMS + k] = second;
+        params[3 * PARAMS + k] = third;
+    }
+}
+
+fn all_finite(what: &str, data: &[f32], each: usize) -> Result<()> {
+    match data.iter().position(|v| !v.is_finite()) {
+        Some(i) => Err(Error::invalid(format!("{what} of person {} are not finite: entry {} is {}", i / each, i % each, data[i]))),
+        None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+#[path = "tests.rs"]
+mod tests;

@@ -1,0 +1,207 @@
+//! Tests of the step with a motion model whose paths are known in closed form.
+
+use super::*;
+use crate::body::tests::{random_params, toy};
+use crate::body::{Frame, joint};
+use crate::sim::{SeedMotion, yaw_towards};
+use glam::{Mat3, Vec2, Vec3};
+
+/// Moves the second seed frame on by `go` in each frame; knows the body of the seed and finds where it stands by two markers.
+struct Screw {
+    go: Frame,
+    shaped: ShapedBody,
+    params: Vec<f32>,
+    markers: Vec<f32>,
+    /// Entry of the prediction that is not finite.
+    broken: Option<usize>,
+}
+
+impl Screw {
+    fn new(body: &BodyModel, people: &People, go: Frame) -> Self {
+        let (params, markers) = (people.params[..PARAMS].to_vec(), people.markers[..MARKER_DIM].to_vec());
+        Self { go, shaped: body.shape(&people.betas[..BETAS]), params, markers, broken: None }
+    }
+}
+
+fn point(m: &[f32], i: usize) -> Vec3 {
+    Vec3::from_slice(&m[3 * i..])
+}
+
+impl MotionModel for Screw {
+    fn latent_dim(&self) -> usize {
+        2
+    }
+
+    fn decode(&self, seed: &[f32], _latent: &[f32], out: &mut [f32]) -> Result<()> {
+        for (seed, out) in seed.chunks_exact(SEED * MARKER_DIM).zip(out.chunks_exact_mut(FUTURE * MARKER_DIM)) {
+            let mut frame = seed[MARKER_DIM..].to_vec();
+            for out in out.chunks_exact_mut(MARKER_DIM) {
+                for p in frame.as_chunks_mut::<3>().0 {
+                    *p = self.go.point((*p).into()).to_array();
+                }
+                out.copy_from_slice(&frame);
+            }
+        }
+        self.broken.into_iter().for_each(|i| out[i] = f32::NAN);
+        Ok(())
+    }
+
+    fn regress(&self, markers: &[f32], _betas: &[f32], out: &mut [f32]) -> Result<()> {
+        let angle = |m: &[f32]| (point(m, 7) - point(m, 40)).truncate().to_angle();
+        for (m, out) in markers.chunks_exact(MARKER_DIM).zip(out.chunks_exact_mut(PARAMS)) {
+            let rot = Mat3::from_rotation_z(angle(m) - angle(&self.markers));
+            let moved = Frame { rot, transl: point(m, 7) - rot * point(&self.markers, 7) };
+            out.copy_from_slice(&self.params);
+            self.shaped.transform_params(out, &moved);
+        }
+        Ok(())
+    }
+
+    fn hash(&self) -> &str {
+        "screw"
+    }
+}
+
+const BETA: [f32; BETAS] = [0.5; BETAS];
+
+/// `n` people on the seed that walks by `go` per frame, each turned and placed differently, and the model that moves them.
+fn walkers(n: usize, go: Frame) -> (People, Arc<BodyModel>, Screw) {
+    let body = Arc::new(toy());
+    let mut one = People::new(1);
+    let still = SeedMotion { params: [random_params(3), random_params(3)].concat(), betas: BETA };
+    one.place(0, &body, &still, 0.0, 0.0, 0.0).unwrap();
+    let mut seed = SeedMotion { params: one.params, betas: BETA };
+    body.shape(&BETA).transform_params(&mut seed.params[PARAMS..], &go);
+    let mut people = People::new(n);
+    for i in 0..n {
+        people.place(i, &body, &seed, 0.7 * i as f32, i as f32, -2.0 * i as f32).unwrap();
+    }
+    let model = Screw::new(&body, &people, go);
+    (people, body, model)
+}
+
+#[test]
+fn placing_faces_and_stands_as_asked() {
+    let (people, ..) = walkers(3, Frame::planar(0.0, 0.0, 0.03));
+    for i in 0..3 {
+        let joints = &people.joints[i * SEED * JOINT_DIM..][..JOINT_DIM];
+        assert!(point(joints, joint::PELVIS).truncate().length() < 1e-5);
+        let across = point(joints, joint::R_HIP) - point(joints, joint::L_HIP);
+        assert!(across.x > 0.0 && across.y.abs() < 1e-5);
+        let pelvis = people.frames[i].point(point(joints, joint::PELVIS));
+        assert!((pelvis.truncate() - Vec2::new(i as f32, -2.0 * i as f32)).length() < 1e-5);
+    }
+    for (dx, dy) in [(1.0, 0.0), (0.0, -1.0), (-0.6, 0.8)] {
+        let forward = Frame::planar(yaw_towards(dx, dy), 0.0, 0.0).rot.y_axis;
+        assert!((forward - Vec3::new(dx, dy, 0.0)).length() < 1e-6);
+    }
+}
+
+/// After any number of steps frame t stands where the screw motion takes the first frame in 18 s + t goes.
+fn follows(go: Frame, steps: usize) {
+    let (mut people, body, model) = walkers(2, go);
+    let start = people.clone();
+    let sim = Sim::new(body, Arc::new(model));
+    let mut out = Primitives::default();
+    for s in 0..steps {
+        sim.step(&mut people, &[0.0; 4], &mut out).unwrap();
+        for i in 0..2 {
+            for t in 0..FRAMES {
+                let moved = (0..s * FUTURE + t).fold(start.frames[i], |f, _| f.compose(&go));
+                let check = |now: &[f32], first: &[f32], each: usize| {
+                    for k in 0..each {
+                        let (now, want) = (out.frames[i].point(point(now, k)), moved.point(point(first, k)));
+                        assert!((now - want).length() < 2e-4, "step {s} person {i} frame {t} point {k}: {now} {want}");
+                    }
+                };
+                let (row, first) = (i * FRAMES + t, i * SEED);
+                check(&out.markers[row * MARKER_DIM..], &start.markers[first * MARKER_DIM..], MARKER_DIM / 3);
+                check(&out.joints[row * JOINT_DIM..], &start.joints[first * JOINT_DIM..], JOINT_DIM / 3);
+                let view = out.frames[i].dir(point(&out.views[3 * row..], 0));
+                assert!((view - moved.dir(point(&start.views[3 * first..], 0))).length() < 1e-4);
+            }
+            // The new seed is the last two frames in their own canonical frame: the same points of the world.
+            for k in 0..SEED * MARKER_DIM / 3 {
+                let last = &out.markers[(i * FRAMES + FUTURE) * MARKER_DIM..];
+                let seed = &people.markers[i * SEED * MARKER_DIM..];
+                let apart = people.frames[i].point(point(seed, k)) - out.frames[i].point(point(last, k));
+                assert!(apart.length() < 1e-5);
+            }
+            assert!(point(&people.joints[i * SEED * JOINT_DIM..], 0).truncate().length() < 1e-5);
+        }
+    }
+}
+
+#[test]
+fn straight_walk_stays_straight() {
+    follows(Frame::planar(0.0, 0.0, 0.03), 6);
+}
+
+#[test]
+fn circling_closes_the_circle() {
+    follows(Frame::planar(0.04, 0.01, 0.03), 9);
+}
+
+#[test]
+fn threads_do_not_matter() {
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let (mut people, body, model) = walkers(13, Frame::planar(0.04, 0.01, 0.03));
+        let sim = Sim::new(body, Arc::new(model));
+        let mut out = Primitives::default();
+        pool.install(|| (0..3).for_each(|_| sim.step(&mut people, &[0.0; 26], &mut out).unwrap()));
+        (people, out.markers)
+    };
+    assert_eq!(run(1), run(3));
+}
+
+#[test]
+fn seam_by_hand() {
+    let mut params = vec![0.0; FRAMES * PARAMS];
+    for (t, value) in [1.0, 2.0, 6.0, 4.0, 10.0].into_iter().enumerate() {
+        params[t * PARAMS + 5] = value;
+        params[t * PARAMS + 6] = value;
+        params[t * PARAMS + 92] = -value;
+    }
+    smooth_seam(&mut params);
+    let column = |k: usize| -> Vec<f32> { (0..5).map(|t| params[t * PARAMS + k]).collect() };
+    assert_eq!(column(5), [1.0, 2.0, 6.0, 4.0, 10.0]);
+    assert_eq!(column(6), [1.0, 2.0, 3.0, 8.0, 10.0]);
+    assert_eq!(column(92), [-1.0, -2.0, -3.0, -8.0, -10.0]);
+}
+
+#[test]
+fn markers_blend_half_and_half() {
+    let (mut people, body, mut model) = walkers(1, Frame::planar(0.0, 0.0, 0.03));
+    // The body found stands 10 cm above the predicted markers.
+    model.params[2] += 0.1;
+    let start = people.markers.clone();
+    let mut out = Primitives::default();
+    Sim::new(body, Arc::new(model)).step(&mut people, &[0.0; 2], &mut out).unwrap();
+    assert_eq!(out.markers[..SEED * MARKER_DIM], start);
+    for t in SEED..FRAMES {
+        let z = out.markers[t * MARKER_DIM + 2];
+        assert!((z - start[2] - 0.05).abs() < 1e-5, "{t}: {z}");
+    }
+}
+
+#[test]
+fn refuses_what_is_not_finite_or_does_not_fit() {
+    let (mut people, body, mut model) = walkers(3, Frame::planar(0.0, 0.0, 0.03));
+    model.broken = Some(FUTURE * MARKER_DIM + 5);
+    let sim = Sim::new(body, Arc::new(model));
+    let before = people.clone();
+    let mut out = Primitives::default();
+    let mut refuse = |people: &mut People, latents: &[f32], words: &str| {
+        let error = sim.step(people, latents, &mut out).unwrap_err().to_string();
+        assert!(error.contains(words), "{error}");
+    };
+    refuse(&mut people, &[0.0; 6], "predicted markers of person 1");
+    refuse(&mut people, &[0.0, 0.0, 0.0, 0.0, f32::NAN, 0.0], "latents of person 2");
+    refuse(&mut people, &[0.0; 5], "expected 3 x 2");
+    assert_eq!(people, before);
+    people.views.pop();
+    refuse(&mut people, &[0.0; 6], "views of 3 people");
+    let seed = SeedMotion { params: vec![0.0; PARAMS], betas: BETA };
+    assert!(people.place(0, &toy(), &seed, 0.0, 0.0, 0.0).unwrap_err().to_string().contains("expected 2 x 93"));
+}

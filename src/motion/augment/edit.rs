@@ -1,0 +1,203 @@
+//! Edits of clips that keep the feet standing: mirroring, another path, another timing, calmer limbs.
+
+use crate::motion::clip::{Clip, FootPose, Pose, SIDES, Skeleton, heading, smoothstep, turn};
+use crate::motion::footlock::{flat, lock_feet, set_feet};
+use crate::body::{BODY_JOINTS, PARENTS};
+use glam::{Quat, Vec2, Vec3, Vec4};
+
+/// The joint on the other side of each body joint.
+const OTHER: [usize; BODY_JOINTS] = [0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20];
+/// Joints above the pelvis, parents first.
+const UPPER: [usize; 13] = [3, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21];
+/// Part of the limbs' swing that [`calm`] takes away at most.
+const CALM: f32 = 0.85;
+
+/// The clip seen in a mirror: x -> -x with left and right swapped.
+pub fn mirror(clip: &Clip) -> Clip {
+    let flip = |q: Quat| Quat::from_xyzw(q.x, -q.y, -q.z, q.w);
+    let poses = clip.poses.iter().map(|p| Pose {
+        root: Vec3::new(-p.root.x, p.root.y, p.root.z),
+        rots: std::array::from_fn(|j| flip(p.rots[OTHER[j]])),
+    });
+    Clip { name: format!("{}~mirror", clip.name), poses: poses.collect(), contact: clip.contact.iter().map(|c| [c[1], c[0]]).collect() }
+}
+
+/// A rigid motion of the floor: turn by `yaw` about the origin, then move by `shift`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Planar {
+    pub yaw: f32,
+    pub shift: Vec2,
+}
+
+impl Planar {
+    fn point(&self, p: Vec3) -> Vec3 {
+        (turn(self.yaw, p.truncate()) + self.shift).extend(p.z)
+    }
+
+    fn rot(&self, q: Quat) -> Quat {
+        (Quat::from_rotation_z(self.yaw) * q).normalize()
+    }
+}
+
+/// The transforms that turn the clip's root path by the angle `yaw[t]` (radians) and shorten each step of it to `stride[t]`.
+///
+/// p'(t) = p'(t-1) + stride R(yaw) (p(t) - p(t-1)) with both factors at the step's middle.
+pub fn bent_path(clip: &Clip, yaw: &[f32], stride: &[f32]) -> Vec<Planar> {
+    let at = |t: usize| clip.poses[t].root.truncate();
+    let mut place = at(0);
+    (0..clip.len())
+        .map(|t| {
+            if t > 0 {
+                let (angle, scale) = (0.5 * (yaw[t] + yaw[t - 1]), 0.5 * (stride[t] + stride[t - 1]));
+                place += scale * turn(angle, at(t) - at(t - 1));
+            }
+            Planar { yaw: yaw[t], shift: place - turn(yaw[t], at(t)) }
+        })
+        .collect()
+}
+
+/// Moves the body along `path` (one transform per frame) while every stance of a foot moves as one rigid piece.
+///
+/// A stance takes the transform of its middle frame, so the foot keeps its own roll and does not slide; in a swing the
+/// foot goes over from one stance's transform to the next by smoothstep. The legs follow by IK.
+pub fn replant(skeleton: &Skeleton, clip: &Clip, path: &[Planar]) -> Clip {
+    let mut out = clip.clone();
+    for (pose, m) in out.poses.iter_mut().zip(path) {
+        pose.root = m.point(pose.root);
+        pose.rots.iter_mut().for_each(|q| *q = m.rot(*q));
+    }
+    let feet = std::array::from_fn(|side| replanted_track(&clip.feet(skeleton, side), &clip.stances(side), path));
+    set_feet(skeleton, &mut out, &feet);
+    out
+}
+
+fn replanted_track(feet: &[FootPose], stances: &[std::ops::Range<usize>], path: &[Planar]) -> Vec<FootPose> {
+    let last = feet.len() - 1;
+    // Stances as (first frame, last frame, transform); the ends of the clip close the outer swings.
+    let mut plants: Vec<(usize, usize, Planar)> = vec![(0, 0, path[0])];
+    plants.extend(stances.iter().map(|s| (s.start, s.end - 1, path[(s.start + s.end - 1) / 2])));
+    plants.push((last, last, path[last]));
+    if stances.first().is_some_and(|s| s.start == 0) {
+        plants.remove(0);
+    }
+    if stances.last().is_some_and(|s| s.end == feet.len()) {
+        plants.pop();
+    }
+    let mut next = 0;
+    (0..feet.len())
+        .map(|t| {
+            while plants[next].1 < t {
+                next += 1;
+            }
+            let (start, _, b) = plants[next];
+            if t >= start {
+                return FootPose { ankle: b.point(feet[t].ankle), rot: b.rot(feet[t].rot), toe: b.rot(feet[t].toe) };
+            }
+            let (_, end, a) = plants[next - 1];
+            let s = smoothstep((t - end) as f32 / (start - end) as f32);
+            let turned = Planar { yaw: a.yaw + s * (b.yaw - a.yaw), shift: Vec2::ZERO };
+            let ankle = a.point(feet[t].ankle).lerp(b.point(feet[t].ankle), s);
+            FootPose { ankle, rot: turned.rot(feet[t].rot), toe: turned.rot(feet[t].toe) }
+        })
+        .collect()
+}
+
+/// The clip at the given frame times (fractional, within the clip; going backwards is allowed).
+///
+/// Positions and rotations are interpolated by Catmull-Rom splines, the feet on their own so that they stay where they stand.
+pub fn resample(skeleton: &Skeleton, clip: &Clip, times: &[f32]) -> Clip {
+    let feet: [Vec<FootPose>; SIDES] = std::array::from_fn(|side| clip.feet(skeleton, side));
+    let n = clip.len();
+    let mut out = Clip { name: clip.name.clone(), poses: Vec::with_capacity(times.len()), contact: Vec::with_capacity(times.len()) };
+    let mut tracks: [Vec<FootPose>; SIDES] = Default::default();
+    for &time in times {
+        let time = time.clamp(0.0, (n - 1) as f32);
+        let base = (time as usize).min(n.saturating_sub(2));
+        let spline = Spline { at: [base.saturating_sub(1), base, (base + 1).min(n - 1), (base + 2).min(n - 1)], s: time - base as f32 };
+        out.poses.push(Pose {
+            root: spline.point(|t| clip.poses[t].root),
+            rots: std::array::from_fn(|j| spline.rot(|t| clip.poses[t].rots[j])),
+        });
+        out.contact.push(clip.contact[time.round() as usize]);
+        for (track, feet) in tracks.iter_mut().zip(&feet) {
+            track.push(FootPose {
+                ankle: spline.point(|t| feet[t].ankle),
+                rot: spline.rot(|t| feet[t].rot),
+                toe: spline.rot(|t| feet[t].toe),
+            });
+        }
+    }
+    set_feet(skeleton, &mut out, &tracks);
+    out
+}
+
+/// Four frames and the place between the middle two.
+struct Spline {
+    at: [usize; 4],
+    s: f32,
+}
+
+impl Spline {
+    fn weights(&self) -> [f32; 4] {
+        let s = self.s;
+        let (s2, s3) = (s * s, s * s * s);
+        [-0.5 * s + s2 - 0.5 * s3, 1.0 - 2.5 * s2 + 1.5 * s3, 0.5 * s + 2.0 * s2 - 1.5 * s3, 0.5 * (s3 - s2)]
+    }
+
+    fn point(&self, value: impl Fn(usize) -> Vec3) -> Vec3 {
+        self.at.iter().zip(self.weights()).map(|(&t, w)| w * value(t)).sum()
+    }
+
+    fn rot(&self, value: impl Fn(usize) -> Quat) -> Quat {
+        let reference = value(self.at[1]);
+        let sum: Vec4 = self
+            .at
+            .iter()
+            .zip(self.weights())
+            .map(|(&t, w)| {
+                let q = value(t);
+                Vec4::from(if q.dot(reference) < 0.0 { -q } else { q }) * w
+            })
+            .sum();
+        Quat::from_vec4(sum).normalize()
+    }
+}
+
+/// Takes the swing out of the body by `amount[t]` (0 none, 1 nearly all): upper limbs go to the clip's mean, feet become
+/// flat, the pelvis level and as high as in mid-stance. For slow, small steps and standing.
+pub fn calm(skeleton: &Skeleton, clip: &Clip, amount: &[f32]) -> Clip {
+    let mut out = clip.clone();
+    let mean = mean_locals(clip);
+    let heights: Vec<f32> = clip.poses.iter().map(|p| p.root.z).collect();
+    let high = crate::motion::clip::quantile(&heights, 0.8);
+    for (t, pose) in out.poses.iter_mut().enumerate() {
+        let a = CALM * amount[t];
+        let old = clip.poses[t].rots;
+        for j in UPPER {
+            let local = old[PARENTS[j]].inverse() * old[j];
+            pose.rots[j] = (pose.rots[PARENTS[j]] * local.slerp(mean[j], a)).normalize();
+        }
+        for leg in &skeleton.legs {
+            let level = flat(heading(old[leg.ankle]));
+            pose.rots[leg.ankle] = old[leg.ankle].slerp(level, a);
+        }
+        pose.root.z += a * (high - pose.root.z);
+    }
+    // Levelled about their ankles, the feet have left the floor and slipped: put them down again, without the new pelvis height.
+    let mut grounded = out.clone();
+    grounded.poses.iter_mut().zip(&clip.poses).for_each(|(p, old)| p.root = old.root);
+    lock_feet(skeleton, &mut grounded);
+    let feet = std::array::from_fn(|side| grounded.feet(skeleton, side));
+    set_feet(skeleton, &mut out, &feet);
+    out
+}
+
+/// Mean local rotation of each joint over the clip.
+fn mean_locals(clip: &Clip) -> [Quat; BODY_JOINTS] {
+    std::array::from_fn(|j| {
+        let local = |p: &Pose| if j == 0 { p.rots[0] } else { p.rots[PARENTS[j]].inverse() * p.rots[j] };
+        let reference = local(&clip.poses[0]);
+        let sum: Vec4 = clip.poses.iter().map(local).map(|q| Vec4::from(if q.dot(reference) < 0.0 { -q } else { q })).sum();
+        Quat::from_vec4(sum).normalize()
+    })
+}

@@ -1,0 +1,181 @@
+//! Augmentation: turning, slowing, stopping, small and backward steps, made from straight walks.
+
+mod edit;
+
+pub use edit::{Planar, bent_path, calm, mirror, replant, resample};
+
+use super::FPS;
+use super::clip::{Clip, SIDES, Skeleton, heading, quantile, smoothstep, wrap};
+use super::footlock::slides;
+use crate::rng::{Stream, stream};
+use rand::RngExt;
+
+/// Fastest yaw rate that bending adds, radians per second (95 degrees).
+const MAX_RATE: f32 = 1.66;
+/// An augmented clip is kept when its 90 % slide (metres) and its 98 % hip twist (radians) stay below these.
+const MAX_SLIDE: f32 = 0.015;
+const MAX_TWIST: f32 = 1.05;
+/// Frames an augmented clip must have.
+const MIN_FRAMES: usize = 40;
+
+/// What one variation does to a clip.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Kind {
+    /// Another path: a smooth random yaw rate.
+    Bent,
+    /// 0.55 to 0.85 of the speed, on another path.
+    SlowBent,
+    /// Stops at a double support, stands, walks on.
+    Stop,
+    /// Small steps or steps on the spot, with strong turns.
+    Small,
+    /// Walks backward: time runs back at 0.6 of the speed.
+    Reversed,
+}
+
+/// Variations made of every clip (each also mirrored).
+pub const RECIPE: [(Kind, usize); 5] = [(Kind::Bent, 2), (Kind::SlowBent, 2), (Kind::Stop, 1), (Kind::Small, 1), (Kind::Reversed, 1)];
+
+/// Variations of `clips` within the limits of slide and hip twist, and how many were made; `seed` fixes all draws.
+pub fn augment(skeleton: &Skeleton, clips: &[Clip], seed: u64) -> (Vec<(Kind, Clip)>, usize) {
+    use rayon::prelude::*;
+    let mut jobs = Vec::new();
+    for clip in clips {
+        for (kind, count) in RECIPE {
+            jobs.extend((0..count).map(|copy| (clip, kind, copy)));
+        }
+    }
+    let made: Vec<Option<(Kind, Clip)>> = jobs
+        .par_iter()
+        .enumerate()
+        .map(|(i, &(clip, kind, copy))| {
+            let mut out = vary(skeleton, clip, kind, &mut stream(seed, "augment", i as u64))?;
+            out.name = format!("{}~{kind:?}{copy}", clip.name).to_lowercase();
+            keep(skeleton, &out).then_some((kind, out))
+        })
+        .collect();
+    (made.into_iter().flatten().collect(), jobs.len())
+}
+
+/// One variation; none when the clip does not offer what it needs.
+fn vary(skeleton: &Skeleton, clip: &Clip, kind: Kind, rng: &mut Stream) -> Option<Clip> {
+    Some(match kind {
+        Kind::Bent => bend(skeleton, clip, 1.0, rng),
+        Kind::SlowBent => {
+            let speed = rng.random_range(0.55..0.85);
+            // The rate is chosen before slowing: what limits a turn is its angle per step.
+            let bent = bend(skeleton, clip, 1.0, rng);
+            resample(skeleton, &bent, &uniform_times(clip.len(), speed))
+        }
+        Kind::Stop => stop(skeleton, clip, rng)?,
+        Kind::Small => small_steps(skeleton, clip, rng),
+        Kind::Reversed => {
+            let bent = bend(skeleton, clip, 0.6, rng);
+            let mut times = uniform_times(clip.len(), 0.6);
+            times.reverse();
+            resample(skeleton, &bent, &times)
+        }
+    })
+}
+
+fn uniform_times(len: usize, speed: f32) -> Vec<f32> {
+    (0..).map(|i| i as f32 * speed).take_while(|&t| t <= (len - 1) as f32).collect()
+}
+
+fn bend(skeleton: &Skeleton, clip: &Clip, strength: f32, rng: &mut Stream) -> Clip {
+    let yaw = random_yaw(clip.len(), strength, rng);
+    replant(skeleton, clip, &bent_path(clip, &yaw, &vec![1.0; clip.len()]))
+}
+
+/// Yaw angle per frame: the integral of a rate that moves smoothly between random values, one each 0.8 to 1.6 s.
+fn random_yaw(len: usize, strength: f32, rng: &mut Stream) -> Vec<f32> {
+    let limit = strength * MAX_RATE;
+    let draw = |rng: &mut Stream| limit * rng.random_range(-1.0f32..1.0);
+    let (mut from, mut to) = (draw(rng), draw(rng));
+    let (mut start, mut span) = (0.0, rng.random_range(0.8..1.6) * FPS);
+    let mut angle = 0.0;
+    (0..len)
+        .map(|t| {
+            while t as f32 - start > span {
+                start += span;
+                span = rng.random_range(0.8..1.6) * FPS;
+                (from, to) = (to, draw(rng));
+            }
+            let rate = from + (to - from) * smoothstep((t as f32 - start) / span);
+            angle += rate / FPS;
+            angle
+        })
+        .collect()
+}
+
+/// Eases to a stand at a double support (the steps before it shrink, limbs calm down), holds, and walks on.
+fn stop(skeleton: &Skeleton, clip: &Clip, rng: &mut Stream) -> Option<Clip> {
+    let n = clip.len();
+    let margin = (0.3 * FPS) as usize;
+    let places: Vec<usize> = (margin..n.saturating_sub(margin)).filter(|&t| clip.contact[t] == [true; SIDES]).collect();
+    let at = *places.get(rng.random_range(0..places.len().max(1)))? as f32;
+    let least = rng.random_range(0.0..0.5f32);
+    // Least stride around the stop, so that both feet are planted beside each other, then back to whole steps.
+    let (flat, ramp) = (0.3 * FPS, rng.random_range(0.4..0.8) * FPS);
+    let fade: Vec<f32> = (0..n).map(|t| 1.0 - smoothstep(((t as f32 - at).abs() - flat) / ramp)).collect();
+    let stride: Vec<f32> = fade.iter().map(|f| 1.0 - (1.0 - least) * f).collect();
+    let quiet: Vec<f32> = fade.iter().map(|f| (1.0 - least) * f).collect();
+    let calmed = calm(skeleton, clip, &quiet);
+    let yaw = random_yaw(n, 0.7, rng);
+    let bent = replant(skeleton, &calmed, &bent_path(&calmed, &yaw, &stride));
+    let hold = rng.random_range(0.3..1.5f32);
+    Some(resample(skeleton, &bent, &stop_times(n, at, rng.random_range(0.3..0.6f32), hold)))
+}
+
+/// Frame times that slow from 1 to 0 towards `at` (frames), stand for `hold` seconds and speed up again.
+///
+/// Each ease takes `ease` seconds, in which half as much of the clip passes.
+fn stop_times(len: usize, at: f32, ease: f32, hold: f32) -> Vec<f32> {
+    let (ease, hold) = (ease * FPS, hold * FPS);
+    let begin = at - 0.5 * ease;
+    // Integral of 1 - smoothstep over the ease: s - s^3 + s^4 / 2, of which one half passes.
+    let passed = |s: f32| ease * (s - s * s * s + 0.5 * s * s * s * s);
+    let time = |t: f32| {
+        let (a, b, c) = (begin + ease, begin + ease + hold, begin + 2.0 * ease + hold);
+        if t < begin {
+            t
+        } else if t < a {
+            begin + passed((t - begin) / ease)
+        } else if t < b {
+            at
+        } else if t < c {
+            at + 0.5 * ease - passed((c - t) / ease)
+        } else {
+            at + 0.5 * ease + t - c
+        }
+    };
+    (0..).map(|t| time(t as f32)).take_while(|&t| t <= (len - 1) as f32).collect()
+}
+
+/// Steps shortened to -0.35 to 0.75 of the clip's, calmer, a little slower, turning strongly when short.
+fn small_steps(skeleton: &Skeleton, clip: &Clip, rng: &mut Stream) -> Clip {
+    let n = clip.len();
+    let (from, to) = (rng.random_range(-0.35..0.75f32), rng.random_range(-0.35..0.75f32));
+    let stride: Vec<f32> = (0..n).map(|t| from + (to - from) * smoothstep(t as f32 / n as f32)).collect();
+    let quiet: Vec<f32> = stride.iter().map(|s| 0.8 * (1.0 - s.abs())).collect();
+    let calmed = calm(skeleton, clip, &quiet);
+    let yaw = random_yaw(n, 1.1, rng);
+    let bent = replant(skeleton, &calmed, &bent_path(&calmed, &yaw, &stride));
+    resample(skeleton, &bent, &uniform_times(n, rng.random_range(0.7..1.0)))
+}
+
+/// Foot yaw against the pelvis in stance, radians, outward or inward alike.
+pub fn hip_twists(skeleton: &Skeleton, clip: &Clip) -> Vec<f32> {
+    let mut out = Vec::new();
+    for side in 0..SIDES {
+        let stands = clip.poses.iter().zip(&clip.contact).filter(|(_, c)| c[side]);
+        out.extend(stands.map(|(p, _)| wrap(heading(p.rots[skeleton.legs[side].ankle]) - heading(p.rots[0])).abs()));
+    }
+    out
+}
+
+fn keep(skeleton: &Skeleton, clip: &Clip) -> bool {
+    clip.len() >= MIN_FRAMES
+        && quantile(&slides(skeleton, clip), 0.9) < MAX_SLIDE
+        && quantile(&hip_twists(skeleton, clip), 0.98) < MAX_TWIST
+}

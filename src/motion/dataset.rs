@@ -1,0 +1,214 @@
+//! From a folder of motion capture to the sets the motion model trains and is judged on.
+
+use super::FPS;
+use super::augment::{Kind, RECIPE, augment, hip_twists, mirror};
+use super::clip::{Clip, Skeleton, quantile, wrap};
+use super::cmu::{SourceClip, read_expmap};
+use super::footlock::slides;
+use super::primitive::MotionSet;
+use super::retarget::{RetargetReport, retarget};
+use super::{FUTURE, bvh::read_bvh};
+use crate::body::{BETAS, BodyModel};
+use crate::{Error, Result};
+use rayon::prelude::*;
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Folders of exponential-map walks below `mocap/cmu_expmap`; running is left out.
+const WALKS: [&str; 4] = ["test/walking", "test/walking_extra", "train/walking", "train/walking_extra"];
+/// BVH files that are used. 131 is a dance with stretched arms, 02_01 stands too high, 01_01 and 05_01 are no locomotion.
+const BVHS: [&str; 1] = ["16_11"];
+/// Clips in which no proper stance is found.
+const DROPPED: [&str; 2] = ["train/walking_extra/walking_25", "train/walking_extra/walking_26"];
+/// Clips kept from training: seven straight walks and a turning one.
+const HELD_OUT: [&str; 8] = [
+    "test/walking_extra/walking_10",
+    "test/walking_extra/walking_11",
+    "test/walking_extra/walking_12",
+    "test/walking_extra/walking_13",
+    "test/walking_extra/walking_14",
+    "test/walking_extra/walking_15",
+    "test/walking_extra/walking_16",
+    "train/walking_extra/walking_49",
+];
+
+/// What is on the floor of a set of clips: how much motion, how fast, how well the feet stand.
+#[derive(Clone, Debug, Default)]
+pub struct SetStats {
+    pub clips: usize,
+    /// Length, seconds.
+    pub seconds: f32,
+    /// Speed over one primitive (0.45 s) along the facing direction, m/s: 1, 5, 50, 95, 99 %.
+    pub speed: [f32; 5],
+    /// Yaw change over one primitive, degrees: 1, 5, 50, 95, 99 %.
+    pub yaw: [f32; 5],
+    /// Slide per stance, metres: median, 90 %.
+    pub slide: [f32; 2],
+    /// Foot yaw against the pelvis in stance, degrees: median, 99 %.
+    pub twist: [f32; 2],
+}
+
+/// What [`build`] measured.
+#[derive(Clone, Debug, Default)]
+pub struct BuildReport {
+    /// Mean limb-joint error of retargeting over clips, metres.
+    pub joint_error: f32,
+    /// Least and greatest shift of a clip onto the floor, metres.
+    pub ground_shift: [f32; 2],
+    /// Slide per stance before and after the foot lock, metres: median, 90 %.
+    pub slide_before: [f32; 2],
+    pub slide_after: [f32; 2],
+    /// Retargeted clips, then each kind of variation, then all of the training set; with how many were made of each.
+    pub sets: Vec<(String, SetStats)>,
+    /// Variations made and kept.
+    pub made: usize,
+    pub kept: usize,
+}
+
+/// Clips on the body before markers are made of them.
+pub struct Clips {
+    /// Training clips with their variations and mirror images.
+    pub train: Vec<Clip>,
+    /// Held-out clips as recorded.
+    pub held_out: Vec<Clip>,
+}
+
+/// Reads the unpacked `mocap-cmu` archive in `data_dir`, retargets it to `model`, augments it and makes its markers.
+///
+/// Returns the training set, the held-out set (never augmented) and what was measured. `seed` fixes the augmentation.
+pub fn build(data_dir: impl AsRef<Path>, seed: u64, model: &BodyModel) -> Result<(MotionSet, MotionSet, BuildReport)> {
+    let skeleton = Skeleton::new(model);
+    let (clips, report) = build_clips(data_dir, seed, &skeleton)?;
+    let body = model.shape(&[0.0; BETAS]);
+    Ok((MotionSet::new(&skeleton, &body, &clips.train), MotionSet::new(&skeleton, &body, &clips.held_out), report))
+}
+
+/// [`build`] up to the clips.
+pub fn build_clips(data_dir: impl AsRef<Path>, seed: u64, skeleton: &Skeleton) -> Result<(Clips, BuildReport)> {
+    let sources = read_sources(data_dir.as_ref())?;
+    let mapped = sources.par_iter().map(|s| retarget(skeleton, s)).collect::<Result<Vec<_>>>()?;
+    let (clips, reports): (Vec<Clip>, Vec<RetargetReport>) = mapped.into_iter().unzip();
+    let mut report = retarget_report(&reports);
+    let (held_out, originals): (Vec<_>, Vec<_>) = clips.into_iter().partition(|c| HELD_OUT.contains(&c.name.as_str()));
+    let (variations, made) = augment(skeleton, &originals, seed);
+    (report.made, report.kept) = (made, variations.len());
+    report.sets.push(("held out".into(), SetStats::new(skeleton, &held_out.iter().collect::<Vec<_>>())));
+    report.sets.push(("original".into(), SetStats::new(skeleton, &originals.iter().collect::<Vec<_>>())));
+    for (kind, _) in RECIPE {
+        let of_kind: Vec<&Clip> = variations.iter().filter(|(k, _)| *k == kind).map(|(_, c)| c).collect();
+        report.sets.push((format!("{kind:?}").to_lowercase(), SetStats::new(skeleton, &of_kind)));
+    }
+    let mut train = originals;
+    train.extend(variations.into_iter().map(|(_, c): (Kind, Clip)| c));
+    train.extend(train.iter().map(mirror).collect::<Vec<_>>());
+    report.sets.push(("training".into(), SetStats::new(skeleton, &train.iter().collect::<Vec<_>>())));
+    Ok((Clips { train, held_out }, report))
+}
+
+fn read_sources(data_dir: &Path) -> Result<Vec<SourceClip>> {
+    let root = if data_dir.join("mocap").is_dir() { data_dir.join("mocap") } else { data_dir.to_path_buf() };
+    if !root.join("cmu_expmap").is_dir() {
+        return Err(Error::file(data_dir, "holds no folder mocap/cmu_expmap: expected the unpacked mocap-cmu archive"));
+    }
+    let mut clips = Vec::new();
+    for set in WALKS {
+        for (path, stem) in sorted_files(&root.join("cmu_expmap").join(set), "txt")? {
+            let name = format!("{set}/{stem}");
+            if !DROPPED.contains(&name.as_str()) {
+                clips.push(read_expmap(path, &name)?);
+            }
+        }
+    }
+    for name in BVHS {
+        clips.push(read_bvh(root.join("cmu_bvh").join(format!("{name}.bvh")), name)?);
+    }
+    Ok(clips)
+}
+
+/// Files of `dir` with the extension, sorted by name, with their stems.
+fn sorted_files(dir: &Path, extension: &str) -> Result<Vec<(PathBuf, String)>> {
+    let mut files = Vec::new();
+    for entry in fs::read_dir(dir).map_err(|e| Error::io(dir, e))? {
+        let path = entry.map_err(|e| Error::io(dir, e))?.path();
+        if path.extension().is_some_and(|e| e == extension) {
+            let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+            files.push((path, stem));
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+fn retarget_report(reports: &[RetargetReport]) -> BuildReport {
+    let shifts: Vec<f32> = reports.iter().map(|r| r.ground_shift).collect();
+    let slide = |of: fn(&RetargetReport) -> &Vec<f32>| {
+        let all: Vec<f32> = reports.iter().flat_map(|r| of(r).clone()).collect();
+        [quantile(&all, 0.5), quantile(&all, 0.9)]
+    };
+    BuildReport {
+        joint_error: reports.iter().map(|r| r.joint_error).sum::<f32>() / reports.len().max(1) as f32,
+        ground_shift: [quantile(&shifts, 0.0), quantile(&shifts, 1.0)],
+        slide_before: slide(|r| &r.slide_before),
+        slide_after: slide(|r| &r.slide_after),
+        ..Default::default()
+    }
+}
+
+impl SetStats {
+    /// Measures `clips`.
+    pub fn new(skeleton: &Skeleton, clips: &[&Clip]) -> Self {
+        let (mut speed, mut yaw) = (Vec::new(), Vec::new());
+        for clip in clips {
+            for t in FUTURE..clip.len() {
+                let (a, b) = (&clip.poses[t - FUTURE], &clip.poses[t]);
+                let forward = (a.rots[0] * glam::Vec3::Z).truncate().normalize_or_zero();
+                speed.push((b.root - a.root).truncate().dot(forward) * FPS / FUTURE as f32);
+                yaw.push(wrap(super::clip::heading(b.rots[0]) - super::clip::heading(a.rots[0])).to_degrees());
+            }
+        }
+        let slide: Vec<f32> = clips.iter().flat_map(|c| slides(skeleton, c)).collect();
+        let twist: Vec<f32> = clips.iter().flat_map(|c| hip_twists(skeleton, c)).collect();
+        let five = |v: &[f32]| [0.01, 0.05, 0.5, 0.95, 0.99].map(|q| quantile(v, q));
+        Self {
+            clips: clips.len(),
+            seconds: clips.iter().map(|c| c.len()).sum::<usize>() as f32 / FPS,
+            speed: five(&speed),
+            yaw: five(&yaw),
+            slide: [quantile(&slide, 0.5), quantile(&slide, 0.9)],
+            twist: [quantile(&twist, 0.5), quantile(&twist, 0.99)].map(f32::to_degrees),
+        }
+    }
+}
+
+impl fmt::Display for BuildReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let cm = |v: f32| 100.0 * v;
+        writeln!(f, "retarget: limb joints off by {:.1} cm, clips shifted onto the floor by {:.1} to {:.1} cm", cm(self.joint_error), cm(self.ground_shift[0]), cm(self.ground_shift[1]))?;
+        writeln!(
+            f,
+            "slide per stance, median / 90 %: {:.2} / {:.2} cm before the foot lock, {:.2} / {:.2} cm after",
+            cm(self.slide_before[0]),
+            cm(self.slide_before[1]),
+            cm(self.slide_after[0]),
+            cm(self.slide_after[1])
+        )?;
+        writeln!(f, "variations within the limits: {} of {}", self.kept, self.made)?;
+        writeln!(f, "{:<10}{:>6}{:>8}  {:<36}{:<32}{:<16}hip twist deg", "set", "clips", "s", "speed m/s 1/5/50/95/99 %", "yaw deg per 0.45 s", "slide cm")?;
+        for (name, s) in &self.sets {
+            let row = |v: &[f32], digits: usize| v.iter().map(|x| format!("{x:.digits$}")).collect::<Vec<_>>().join(" / ");
+            writeln!(
+                f,
+                "{name:<10}{:>6}{:>8.0}  {:<36}{:<32}{:<16}{}",
+                s.clips,
+                s.seconds,
+                row(&s.speed, 2),
+                row(&s.yaw, 0),
+                row(&s.slide.map(cm), 2),
+                row(&s.twist, 0)
+            )?;
+        }
+        Ok(())
+    }
+}
+

@@ -28,9 +28,10 @@ struct Words<'a> {
 
 impl<'a> Words<'a> {
     fn new(path: &'a Path, text: &'a str) -> Self {
-        let words = text.lines().enumerate().flat_map(|(l, line)| {
-            line.split_whitespace().map(move |w| (l + 1, w.as_ptr() as usize - line.as_ptr() as usize + 1, w))
-        });
+        let words = text
+            .lines()
+            .enumerate()
+            .flat_map(|(l, line)| line.split_whitespace().map(move |w| (l + 1, w.as_ptr() as usize - line.as_ptr() as usize + 1, w)));
         Self { path, words: words.collect(), next: 0 }
     }
 
@@ -147,9 +148,10 @@ fn check_topology(path: &Path, joints: &[Joint]) -> Result<()> {
         return Err(Error::file(path, format!("has {} joints with its ends, expected the {CMU_JOINTS} of the CMU skeleton", joints.len())));
     }
     match (0..CMU_JOINTS).find(|&j| joints[j].parent != CMU_PARENTS[j]) {
-        Some(j) => {
-            Err(Error::file(path, format!("joint {j} hangs on joint {}, expected {} as in the CMU skeleton", joints[j].parent, CMU_PARENTS[j])))
-        }
+        Some(j) => Err(Error::file(
+            path,
+            format!("joint {j} hangs on joint {}, expected {} as in the CMU skeleton", joints[j].parent, CMU_PARENTS[j]),
+        )),
         None => Ok(()),
     }
 }

@@ -106,9 +106,12 @@ pub fn read_expmap(path: impl AsRef<Path>, name: &str) -> Result<SourceClip> {
 fn parse_row(path: &Path, line_no: usize, line: &str) -> Result<Vec<f32>> {
     let mut row = Vec::with_capacity(COLUMNS);
     for (c, field) in line.split(',').enumerate() {
-        let value = field.trim().parse::<f32>().ok().filter(|v| v.is_finite()).ok_or_else(|| {
-            Error::file(path, format!("line {line_no}, column {}: '{}' is not a finite number", c + 1, field.trim()))
-        })?;
+        let value = field
+            .trim()
+            .parse::<f32>()
+            .ok()
+            .filter(|v| v.is_finite())
+            .ok_or_else(|| Error::file(path, format!("line {line_no}, column {}: '{}' is not a finite number", c + 1, field.trim())))?;
         row.push(value);
     }
     if row.len() != COLUMNS {

@@ -184,7 +184,13 @@ impl SetStats {
 impl fmt::Display for BuildReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let cm = |v: f32| 100.0 * v;
-        writeln!(f, "retarget: limb joints off by {:.1} cm, clips shifted onto the floor by {:.1} to {:.1} cm", cm(self.joint_error), cm(self.ground_shift[0]), cm(self.ground_shift[1]))?;
+        writeln!(
+            f,
+            "retarget: limb joints off by {:.1} cm, clips shifted onto the floor by {:.1} to {:.1} cm",
+            cm(self.joint_error),
+            cm(self.ground_shift[0]),
+            cm(self.ground_shift[1])
+        )?;
         writeln!(
             f,
             "slide per stance, median / 90 %: {:.2} / {:.2} cm before the foot lock, {:.2} / {:.2} cm after",
@@ -194,7 +200,11 @@ impl fmt::Display for BuildReport {
             cm(self.slide_after[1])
         )?;
         writeln!(f, "variations within the limits: {} of {}", self.kept, self.made)?;
-        writeln!(f, "{:<10}{:>6}{:>8}  {:<36}{:<32}{:<16}hip twist deg", "set", "clips", "s", "speed m/s 1/5/50/95/99 %", "yaw deg per 0.45 s", "slide cm")?;
+        writeln!(
+            f,
+            "{:<10}{:>6}{:>8}  {:<36}{:<32}{:<16}hip twist deg",
+            "set", "clips", "s", "speed m/s 1/5/50/95/99 %", "yaw deg per 0.45 s", "slide cm"
+        )?;
         for (name, s) in &self.sets {
             let row = |v: &[f32], digits: usize| v.iter().map(|x| format!("{x:.digits$}")).collect::<Vec<_>>().join(" / ");
             writeln!(
@@ -211,4 +221,3 @@ impl fmt::Display for BuildReport {
         Ok(())
     }
 }
-

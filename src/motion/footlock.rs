@@ -63,9 +63,8 @@ pub fn lock_feet(skeleton: &Skeleton, clip: &mut Clip) {
 
 /// Puts the feet `feet` (one track per side) under the clip, lowering the pelvis smoothly where a leg would not reach.
 pub fn set_feet(skeleton: &Skeleton, clip: &mut Clip, feet: &[Vec<FootPose>; SIDES]) {
-    let drop: Vec<f32> = (0..clip.len())
-        .map(|t| (0..SIDES).map(|s| overreach(skeleton, &clip.poses[t], s, feet[s][t].ankle)).fold(0.0, f32::max))
-        .collect();
+    let drop: Vec<f32> =
+        (0..clip.len()).map(|t| (0..SIDES).map(|s| overreach(skeleton, &clip.poses[t], s, feet[s][t].ankle)).fold(0.0, f32::max)).collect();
     for (t, drop) in smooth_envelope(&drop, 5).into_iter().enumerate() {
         clip.poses[t].root.z -= drop;
         place_feet(skeleton, &mut clip.poses[t], &[feet[0][t], feet[1][t]]);

@@ -1,14 +1,5 @@
 //! Motion: clips, canonical primitives, the motion-primitive model.
 
-<<<<<<< HEAD
-mod net;
-mod predictor;
-mod regressor;
-mod weights;
-
-pub use predictor::Predictor;
-pub use regressor::Regressor;
-=======
 pub mod augment;
 pub mod bvh;
 pub mod clip;
@@ -16,13 +7,17 @@ pub mod cmu;
 pub mod dataset;
 pub mod footlock;
 pub mod ik;
+mod net;
+mod predictor;
 pub mod primitive;
+mod regressor;
 pub mod retarget;
 mod weights;
 
 pub use dataset::{BuildReport, build};
+pub use predictor::Predictor;
 pub use primitive::{ClipMarkers, MotionSet};
->>>>>>> 741ea55 (Import mocap onto the body, lock its feet, vary it and cut primitives)
+pub use regressor::Regressor;
 pub use weights::{
     CONFIG_FILE, CONTINUOUS, Dense, Gru, MotionConfig, MotionWeights, Named, PREDICTOR_FILE, Parameters, PredictorSizes, PredictorWeights,
     REGRESSOR_FILE, RegressorSizes, RegressorWeights,

@@ -1,8 +1,8 @@
 //! Edits of clips that keep the feet standing: mirroring, another path, another timing, calmer limbs.
 
+use crate::body::{BODY_JOINTS, PARENTS};
 use crate::motion::clip::{Clip, FootPose, Pose, SIDES, Skeleton, heading, smoothstep, turn};
 use crate::motion::footlock::{flat, lock_feet, set_feet};
-use crate::body::{BODY_JOINTS, PARENTS};
 use glam::{Quat, Vec2, Vec3, Vec4};
 
 /// The joint on the other side of each body joint.
@@ -15,10 +15,10 @@ const CALM: f32 = 0.85;
 /// The clip seen in a mirror: x -> -x with left and right swapped.
 pub fn mirror(clip: &Clip) -> Clip {
     let flip = |q: Quat| Quat::from_xyzw(q.x, -q.y, -q.z, q.w);
-    let poses = clip.poses.iter().map(|p| Pose {
-        root: Vec3::new(-p.root.x, p.root.y, p.root.z),
-        rots: std::array::from_fn(|j| flip(p.rots[OTHER[j]])),
-    });
+    let poses = clip
+        .poses
+        .iter()
+        .map(|p| Pose { root: Vec3::new(-p.root.x, p.root.y, p.root.z), rots: std::array::from_fn(|j| flip(p.rots[OTHER[j]])) });
     Clip { name: format!("{}~mirror", clip.name), poses: poses.collect(), contact: clip.contact.iter().map(|c| [c[1], c[0]]).collect() }
 }
 

@@ -1,0 +1,109 @@
+//! What a motion task is, as data.
+
+use egogen::scene::SparseScenes;
+use egogen::{Error, Result};
+use serde::{Deserialize, Serialize};
+
+/// Weights of the reward terms: Tab. S2, with the authors' 0.1 for the sparse penetration term, which the table leaves open.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Weights {
+    pub floor: f32,
+    pub skate: f32,
+    pub dist: f32,
+    pub orient: f32,
+    pub attention: f32,
+    pub penetration: f32,
+    pub success: f32,
+    /// Not in the paper (0 there): paid on success for every step left. Each step alive pays about 0.5, so without this a
+    /// policy gains by hovering at the goal until the last step.
+    pub arrival: f32,
+}
+
+impl Default for Weights {
+    fn default() -> Self {
+        Self { floor: 0.1, skate: 0.3, dist: 1.0, orient: 0.1, attention: 0.3, penetration: 0.1, success: 0.5, arrival: 0.0 }
+    }
+}
+
+/// The task of walking to a goal in a sparse scene. Defaults are the paper's.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct MotionTask {
+    /// How scenes, starts and goals are drawn.
+    pub scene: SparseScenes,
+    pub weights: Weights,
+    /// Steps (of 0.45 s) after which an episode ends. The observation shows the time, so this is a termination.
+    pub max_depth: u32,
+    /// People start facing the goal but for a turn of up to this, degrees either way.
+    pub yaw_noise_deg: f32,
+    /// The goal is reached when the pelvis is nearer than this at the end of a step, metres (eq. 10).
+    pub success_distance: f32,
+    /// That many non-walkable cells under the body's box are a penetration, which ends the episode (eq. 7).
+    pub blocked_cells: usize,
+    /// Side of those cells, metres.
+    pub cell: f32,
+}
+
+impl Default for MotionTask {
+    fn default() -> Self {
+        Self {
+            scene: SparseScenes::default(),
+            weights: Weights::default(),
+            max_depth: 11,
+            yaw_noise_deg: 36.0,
+            success_distance: 0.1,
+            blocked_cells: 3,
+            cell: 0.1,
+        }
+    }
+}
+
+impl MotionTask {
+    /// Refuses values that make no task; the message names the key and what would be right.
+    pub fn validate(&self) -> Result<()> {
+        self.scene.validate()?;
+        let need = |ok: bool, key: &str, right: &str| {
+            if ok { Ok(()) } else { Err(Error::invalid(format!("{key}: expected {right}"))) }
+        };
+        for term in super::TERMS {
+            let weight = (term.weight)(&self.weights);
+            need(weight.is_finite(), &format!("weights.{}", term.name), "a finite number")?;
+        }
+        need((1..=1000).contains(&self.max_depth), "max_depth", "1 to 1000 steps")?;
+        need((0.0..=180.0).contains(&self.yaw_noise_deg), "yaw_noise_deg", "0 to 180 degrees")?;
+        need(self.success_distance > 0.0 && self.success_distance <= 1.0, "success_distance", "more than 0, at most 1 m")?;
+        need(self.blocked_cells >= 1, "blocked_cells", "1 or more")?;
+        need((0.01..=0.5).contains(&self.cell), "cell", "0.01 to 0.5 m")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_are_valid_and_complete_themselves() {
+        let task: MotionTask = serde_json::from_str(r#"{"weights": {"arrival": 0.8}, "max_depth": 13}"#).unwrap();
+        task.validate().unwrap();
+        let weights = Weights { arrival: 0.8, ..Default::default() };
+        assert_eq!(task, MotionTask { weights, max_depth: 13, ..Default::default() });
+        assert!(serde_json::from_str::<MotionTask>(r#"{"max_deph": 13}"#).unwrap_err().to_string().contains("max_deph"));
+    }
+
+    #[test]
+    fn unusable_values_are_named() {
+        for (text, key) in [
+            (r#"{"max_depth": 0}"#, "max_depth"),
+            (r#"{"yaw_noise_deg": -1.0}"#, "yaw_noise_deg"),
+            (r#"{"success_distance": 0.0}"#, "success_distance"),
+            (r#"{"blocked_cells": 0}"#, "blocked_cells"),
+            (r#"{"cell": 0.0}"#, "cell"),
+            (r#"{"weights": {"skate": 1e39}}"#, "weights.skate"),
+            (r#"{"scene": {"side": [2.0, 1.0]}}"#, "scene.side"),
+        ] {
+            let task: MotionTask = serde_json::from_str(text).unwrap();
+            assert!(task.validate().unwrap_err().to_string().starts_with(key), "{key}");
+        }
+    }
+}

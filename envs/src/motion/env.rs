@@ -1,0 +1,229 @@
+//! The vectorised environment of the motion task.
+
+use super::member::{Member, OBS, STATE, blocked};
+use super::{EPISODE, MotionTask, TERMS};
+use crate::{ActionSpace, EnvError, EnvSpec, ObsGroup, StepResult, VecEnv};
+use egogen::motion::SEED;
+use egogen::rng::stream;
+use egogen::scene::Setting;
+use egogen::sensing::RAYS;
+use egogen::sim::{People, Primitives, SeedBank, Sim, yaw_towards};
+use rand::RngExt;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// First word of a saved state; counts up when its layout changes.
+const KIND: &str = "motion-env 1";
+
+/// Which episodes are played. The draws of episode k of environment i depend on the seed and on:
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Starts {
+    /// (i, k): training; the number of environments has no influence.
+    Fresh,
+    /// k n + i: evaluation; start number j is the same for every policy, however long its episodes are.
+    Fixed,
+}
+
+/// n people on the motion task, each in a random scene of its own that changes with every episode.
+///
+/// Observation: "state" [2, 402] (per seed frame 67 markers, then 67 unit vectors from marker to goal; canonical frame),
+/// "egosensing" [2, 32] (see [`egogen::sensing::look`]), "dist" [1] = 1 / (1 + d), "time" [1] = 1 - steps / max_depth.
+/// Action: the latent of the motion model, unbounded. Info: the weighted reward terms. Episodes end on success, on
+/// penetration and at the step limit (all of them terminations). Figures of an episode: see [`EPISODE`].
+pub struct MotionEnv {
+    spec: EnvSpec,
+    task: MotionTask,
+    starts: Starts,
+    sim: Arc<Sim>,
+    bank: Arc<SeedBank>,
+    state: State,
+    prims: Primitives,
+}
+
+type Identity = (MotionTask, Starts, String);
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct State {
+    seed: u64,
+    people: People,
+    members: Vec<Member>,
+}
+
+impl MotionEnv {
+    /// n environments that train on fresh scenes drawn from `seed`.
+    pub fn new(task: MotionTask, sim: Arc<Sim>, bank: Arc<SeedBank>, n: usize, seed: u64) -> Result<Self, EnvError> {
+        Self::with_starts(task, sim, bank, n, seed, Starts::Fresh)
+    }
+
+    /// n environments that play a numbered list of starts fixed by `seed`: first 0 to n-1, then environment i goes on to n+i.
+    pub fn evaluation(task: MotionTask, sim: Arc<Sim>, bank: Arc<SeedBank>, n: usize, seed: u64) -> Result<Self, EnvError> {
+        Self::with_starts(task, sim, bank, n, seed, Starts::Fixed)
+    }
+
+    fn with_starts(task: MotionTask, sim: Arc<Sim>, bank: Arc<SeedBank>, n: usize, seed: u64, starts: Starts) -> Result<Self, EnvError> {
+        task.validate()?;
+        if bank.seeds.is_empty() {
+            return Err(EnvError::Invalid("the seed bank is empty, expected at least one seed motion".into()));
+        }
+        let spec = spec(sim.model().latent_dim());
+        let state = State { seed, people: People::new(n), members: vec![Member::default(); n] };
+        let mut env = Self { spec, task, starts, sim, bank, state, prims: Primitives::default() };
+        env.restart(seed)?;
+        Ok(env)
+    }
+
+    /// The task.
+    pub fn task(&self) -> &MotionTask {
+        &self.task
+    }
+
+    /// Where everyone stands now.
+    pub fn people(&self) -> &People {
+        &self.state.people
+    }
+
+    /// The motion of the last step, of the episodes that it may have ended.
+    pub fn primitives(&self) -> &Primitives {
+        &self.prims
+    }
+
+    /// Scene, start and goal of environment `i`'s present episode (ask before a step to know where that step happens).
+    pub fn setting(&self, i: usize) -> &Setting {
+        &self.state.members[i].setting
+    }
+
+    /// Number of the start that environment `i` plays now; meaningful for [`Starts::Fixed`].
+    pub fn start_number(&self, i: usize) -> u64 {
+        self.draw_index(i, self.state.members[i].episode)
+    }
+
+    /// What a saved state must have in common with this environment.
+    fn identity(&self) -> Identity {
+        (self.task.clone(), self.starts, self.sim.model().hash().to_string())
+    }
+
+    fn draw_index(&self, i: usize, episode: u64) -> u64 {
+        match self.starts {
+            Starts::Fresh => ((i as u64) << 40) + episode,
+            Starts::Fixed => episode * self.num_envs() as u64 + i as u64,
+        }
+    }
+
+    fn restart(&mut self, seed: u64) -> Result<(), EnvError> {
+        self.state.seed = seed;
+        (0..self.num_envs()).try_for_each(|i| self.begin(i, 0))
+    }
+
+    /// Draws scene, start, seed motion and turn until the body's box is free of blocked cells.
+    fn begin(&mut self, i: usize, episode: u64) -> Result<(), EnvError> {
+        let purpose = if self.starts == Starts::Fixed { "fixed start" } else { "episode" };
+        let mut rng = stream(self.state.seed, purpose, self.draw_index(i, episode));
+        let noise = self.task.yaw_noise_deg.to_radians();
+        for _ in 0..1000 {
+            let setting = self.task.scene.draw(&mut rng)?;
+            let to = setting.goal - setting.start;
+            let turn = rng.random_range(-noise..=noise);
+            let seed = &self.bank.seeds[rng.random_range(0..self.bank.seeds.len())];
+            let yaw = yaw_towards(to.x, to.y) + turn;
+            self.state.people.place(i, self.sim.body(), seed, yaw, setting.start.x, setting.start.y)?;
+            if blocked(&self.task, &self.state.people, i, &setting.scene.walkable) == 0 {
+                self.state.members[i] = Member::begin(episode, setting, &self.state.people, i);
+                return Ok(());
+            }
+        }
+        Err(EnvError::Invalid("no free start in 1000 draws: give scene.clearance more room".into()))
+    }
+
+    fn write_obs(&self, obs: &mut [f32]) {
+        let State { people, members, .. } = &self.state;
+        let rows = obs.par_chunks_exact_mut(OBS).zip(members).with_min_len(8);
+        rows.enumerate().for_each(|(i, (row, member))| member.observe(&self.task, people, i, row));
+    }
+
+    /// Judges everyone after a step; returns who ended.
+    fn judge(&mut self, out: &mut StepResult) -> Result<Vec<usize>, EnvError> {
+        let State { people, members, .. } = &mut self.state;
+        let (task, prims, people) = (&self.task, &self.prims, &*people);
+        let (terms, figures) = (out.info.par_chunks_exact_mut(TERMS.len()), out.episode.par_chunks_exact_mut(EPISODE.len()));
+        let each = (members, terms, figures, &mut out.reward, &mut out.terminated).into_par_iter().with_min_len(8);
+        each.enumerate().for_each(|(i, (member, terms, episode, reward, ended))| {
+            let verdict = member.judge(task, people, prims, i, terms, episode);
+            (*reward, *ended) = (verdict.reward, verdict.ended);
+        });
+        if let Some(i) = out.reward.iter().position(|r| !r.is_finite()) {
+            let k = out.info[i * TERMS.len()..].iter().position(|t| !t.is_finite()).unwrap_or(0);
+            let what = format!("reward term '{}' of environment {i} is {}", TERMS[k].name, out.info[i * TERMS.len() + k]);
+            return Err(EnvError::Invalid(format!("{what}: the motion model left all bounds")));
+        }
+        Ok((0..out.terminated.len()).filter(|&i| out.terminated[i]).collect())
+    }
+}
+
+impl VecEnv for MotionEnv {
+    fn spec(&self) -> &EnvSpec {
+        &self.spec
+    }
+
+    fn num_envs(&self) -> usize {
+        self.state.members.len()
+    }
+
+    fn reset(&mut self, seed: u64, obs: &mut Vec<f32>) -> Result<(), EnvError> {
+        self.restart(seed)?;
+        self.observe(obs)
+    }
+
+    fn step(&mut self, actions: &[f32], out: &mut StepResult) -> Result<(), EnvError> {
+        self.spec.check_actions(self.num_envs(), actions)?;
+        out.prepare(&self.spec, self.num_envs());
+        self.sim.step(&mut self.state.people, actions, &mut self.prims)?;
+        let ended = self.judge(out)?;
+        self.write_obs(&mut out.final_obs);
+        out.obs.copy_from_slice(&out.final_obs);
+        for i in ended {
+            self.begin(i, self.state.members[i].episode + 1)?;
+            self.state.members[i].observe(&self.task, &self.state.people, i, &mut out.obs[i * OBS..(i + 1) * OBS]);
+        }
+        Ok(())
+    }
+
+    fn save_state(&self) -> Result<Vec<u8>, EnvError> {
+        let saved = (KIND, self.identity(), &self.state);
+        postcard::to_stdvec(&saved).map_err(|e| EnvError::Invalid(format!("cannot save the motion environments: {e}")))
+    }
+
+    fn load_state(&mut self, state: &[u8]) -> Result<(), EnvError> {
+        let bad = |why: String| EnvError::Invalid(format!("not a saved state of these {} motion environments: {why}", self.num_envs()));
+        let (kind, rest) = postcard::take_from_bytes::<&str>(state).map_err(|e| bad(e.to_string()))?;
+        if kind != KIND {
+            return Err(bad(format!("it is of kind '{kind}', expected '{KIND}'")));
+        }
+        let (identity, state): (Identity, State) = postcard::from_bytes(rest).map_err(|e| bad(e.to_string()))?;
+        if identity != self.identity() {
+            return Err(bad("it was saved with another task, motion model or choice of starts".into()));
+        }
+        if state.members.len() != self.num_envs() {
+            return Err(bad(format!("it holds {}", state.members.len())));
+        }
+        self.state = state;
+        Ok(())
+    }
+
+    fn observe(&self, obs: &mut Vec<f32>) -> Result<(), EnvError> {
+        obs.clear();
+        obs.resize(self.num_envs() * OBS, 0.0);
+        self.write_obs(obs);
+        Ok(())
+    }
+}
+
+fn spec(latent_dim: usize) -> EnvSpec {
+    let group = |name: &str, shape: &[usize]| ObsGroup { name: name.into(), shape: shape.to_vec() };
+    EnvSpec {
+        obs: vec![group("state", &[SEED, STATE / SEED]), group("egosensing", &[SEED, RAYS]), group("dist", &[1]), group("time", &[1])],
+        action: ActionSpace::Continuous(latent_dim),
+        info: TERMS.iter().map(|t| t.name.to_string()).collect(),
+        episode: EPISODE.iter().map(|s| s.to_string()).collect(),
+    }
+}

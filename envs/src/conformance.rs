@@ -5,7 +5,8 @@ use egogen::rng::{Stream, stream};
 use rand::RngExt;
 use rand_distr::StandardNormal;
 
-const ENVS: usize = 4;
+/// Enough that work is spread over threads.
+const ENVS: usize = 9;
 const SEED: u64 = 5;
 
 /// How hard an environment is tried.

@@ -41,6 +41,9 @@ pub struct MotionEnv {
     prims: Primitives,
 }
 
+/// Fewest people that one task works on.
+const CHUNK: usize = 4;
+
 type Identity = (MotionTask, Starts, String);
 
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -137,7 +140,7 @@ impl MotionEnv {
 
     fn write_obs(&self, obs: &mut [f32]) {
         let State { people, members, .. } = &self.state;
-        let rows = obs.par_chunks_exact_mut(OBS).zip(members).with_min_len(8);
+        let rows = obs.par_chunks_exact_mut(OBS).zip(members).with_min_len(CHUNK);
         rows.enumerate().for_each(|(i, (row, member))| member.observe(&self.task, people, i, row));
     }
 
@@ -146,7 +149,7 @@ impl MotionEnv {
         let State { people, members, .. } = &mut self.state;
         let (task, prims, people) = (&self.task, &self.prims, &*people);
         let (terms, figures) = (out.info.par_chunks_exact_mut(TERMS.len()), out.episode.par_chunks_exact_mut(EPISODE.len()));
-        let each = (members, terms, figures, &mut out.reward, &mut out.terminated).into_par_iter().with_min_len(8);
+        let each = (members, terms, figures, &mut out.reward, &mut out.terminated).into_par_iter().with_min_len(CHUNK);
         each.enumerate().for_each(|(i, (member, terms, episode, reward, ended))| {
             let verdict = member.judge(task, people, prims, i, terms, episode);
             (*reward, *ended) = (verdict.reward, verdict.ended);
@@ -203,7 +206,7 @@ impl VecEnv for MotionEnv {
         if identity != self.identity() {
             return Err(bad("it was saved with another task, motion model or choice of starts".into()));
         }
-        if state.members.len() != self.num_envs() {
+        if [state.members.len(), state.people.len()] != [self.num_envs(); 2] {
             return Err(bad(format!("it holds {}", state.members.len())));
         }
         self.state = state;

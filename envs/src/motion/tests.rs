@@ -108,10 +108,10 @@ fn gliding_into_the_box_penetrates() {
     let mut hit = [false; 8];
     for _ in 0..8 {
         env.step(&[0.8, 0.0, 0.0, 0.0].repeat(8), &mut out).unwrap();
-        for i in 0..8 {
+        for (i, hit) in hit.iter_mut().enumerate() {
             let info = &out.info[i * TERMS.len()..][..TERMS.len()];
             assert_eq!(info[5] == 0.0, out.terminated[i], "the term is lost exactly where the episode ends");
-            hit[i] |= out.terminated[i];
+            *hit |= out.terminated[i];
             let figures = &out.episode[i * EPISODE.len()..][..EPISODE.len()];
             assert_eq!(figures[1] == 1.0, out.terminated[i]);
             assert_eq!(figures[0], 0.0);

@@ -130,7 +130,7 @@ impl Bundle {
 
     /// The policy on `device`.
     pub fn network(&self, device: &Device) -> Network {
-        Network::new(self.spec.clone(), &self.params, device)
+        Network::new(&self.spec, &self.params, device)
     }
 
     fn golden(&self) -> Golden {

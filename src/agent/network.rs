@@ -7,7 +7,6 @@ use super::spec::{Dense, Part, PolicySpec};
 use burn::tensor::activation::{relu, sigmoid, tanh};
 use burn::tensor::module::linear;
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
-use std::sync::Arc;
 
 /// Slope of the leaky ReLU below zero.
 pub const SLOPE: f32 = 0.01;
@@ -29,24 +28,25 @@ struct Layer {
 
 /// A policy's weights on a device.
 pub struct Network {
-    spec: Arc<PolicySpec>,
+    spec: PolicySpec,
     layers: Vec<Layer>,
     device: Device,
 }
 
 impl Network {
-    /// Copies the flat parameters to `device`.
+    /// Copies the flat parameters to `device`; on an autodiff device they are the leaves of gradients.
     ///
     /// # Panics
     /// When `flat` is not `spec.params()` long.
-    pub fn new(spec: Arc<PolicySpec>, flat: &[f32], device: &Device) -> Self {
+    pub fn new(spec: &PolicySpec, flat: &[f32], device: &Device) -> Self {
         assert_eq!(flat.len(), spec.params(), "parameters of another policy");
+        let inner = device.clone().without_autodiff();
         let layer = |d: &Dense| Layer {
-            weight: Tensor::from_data(TensorData::new(d.weight_of(flat).to_vec(), [d.output, d.input]), device),
-            bias: Tensor::from_data(TensorData::new(d.bias_of(flat).to_vec(), [d.output]), device),
+            weight: Tensor::from_data(TensorData::new(d.weight_of(flat).to_vec(), [d.output, d.input]), &inner),
+            bias: Tensor::from_data(TensorData::new(d.bias_of(flat).to_vec(), [d.output]), &inner),
         };
-        let layers = spec.layers.iter().map(layer).collect();
-        Self { spec, layers, device: device.clone() }
+        let network = Self { spec: spec.clone(), layers: spec.layers.iter().map(layer).collect(), device: inner };
+        if device.is_autodiff() { network.with_gradients() } else { network }
     }
 
     /// The same weights as leaves of a gradient graph of their own.

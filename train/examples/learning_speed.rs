@@ -1,12 +1,12 @@
 //! Steps per second of acting and learning on an environment that costs nothing, with the motion task's shapes.
 //!
-//! `cargo run --release -p egogen-train --example learning_speed [quick|paper]`
+//! `cargo run --release -p egogen-train --example learning_speed [quick|paper] [own|burn]`
 
+use egogen::DeviceChoice;
 use egogen::agent::{ObsGroup, ObsLayout, PolicyConfig, PolicySpec};
 use egogen::rng::stream;
-use egogen_train::{AdamConfig, AdamW, Learner, PpoConfig, Rollout, Shards};
+use egogen_train::{AdamConfig, AdamW, Compute, Learner, PpoConfig, Rollout, Shards};
 use rand_distr::{Distribution, StandardNormal};
-use std::sync::Arc;
 use std::time::Instant;
 
 const ENVS: usize = 256;
@@ -18,12 +18,16 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let config: PolicyConfig = toml::from_str(sizes)?;
     let group = |name: &str, shape: &[usize]| ObsGroup { name: name.into(), shape: shape.to_vec() };
     let groups = vec![group("state", &[2, 402]), group("egosensing", &[2, 32]), group("dist", &[1]), group("time", &[1])];
-    let spec = Arc::new(PolicySpec::new(config, ObsLayout::new(groups), 128)?);
+    let spec = PolicySpec::new(config, ObsLayout::new(groups), 128)?;
     let threads = rayon::current_num_threads();
     let params = spec.init(0);
     println!("{} parameters, {threads} threads", params.len());
+    let compute = match std::env::args().nth(2).as_deref() {
+        Some("burn") => Compute::Burn(DeviceChoice::Flex.device()?),
+        _ => Compute::Own,
+    };
     let adam = AdamW::new(params.len());
-    let mut learner = Learner::new(spec.clone(), burn::tensor::Device::flex(), Shards::new(2, threads)?, params, adam, 0);
+    let mut learner = Learner::new(spec.clone(), compute, Shards::new(2, threads)?, params, adam, 0)?;
     let ppo: PpoConfig = toml::from_str(
         "gamma = 0.99\nlambda = 0.95\nclip = 0.1\nvalue = 1.0\nentropy = 0.0\nkl_prior = 1.0\nmax_grad_norm = 0.1\npasses = 1\nbatch = 256",
     )?;
@@ -33,11 +37,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let start = Instant::now();
         let mut rollout = Rollout::default();
         for rows in obs.chunks(ENVS * spec.layout.dim()) {
-            let acts = learner.actor().act(rows);
+            let acts = learner.policy().act(rows)?;
             rollout.actions.extend(acts.sample(0, "speed actions", round));
             rollout.value.extend(acts.value);
         }
-        learner.actor().values(&obs[..ENVS * spec.layout.dim()]);
+        learner.policy().values(&obs[..ENVS * spec.layout.dim()])?;
         let acted = start.elapsed().as_secs_f64();
         let total = ENVS * STEPS;
         rollout.log_prob = vec![-180.0; total];

@@ -1,6 +1,6 @@
 //! Steps environments with the current policy and records what learning needs.
 
-use crate::actor::{Actor, Acts};
+use crate::policy::{Acts, Policy};
 use crate::{Error, Result};
 use egogen::agent::log_prob_of;
 use egogen::rng::stream;
@@ -71,13 +71,13 @@ impl Collector {
     }
 
     /// Steps all environments `steps` times.
-    pub fn collect(&mut self, actor: &Actor, steps: usize) -> Result<Rollout> {
+    pub fn collect(&mut self, policy: &Policy, steps: usize) -> Result<Rollout> {
         let envs = self.env.num_envs();
         let mut out = Rollout { info: vec![0.0; self.env.spec().info.len()], ..Rollout::default() };
         // Observations whose value the next step does not bring along: entry of the rollout and the observation.
         let mut extra: (Vec<usize>, Vec<f32>) = Default::default();
         for t in 0..steps {
-            let acts = actor.act(&self.obs);
+            let acts = policy.act(&self.obs)?;
             let first = out.reward.len();
             if t > 0 {
                 out.next_value[first - envs..].copy_from_slice(&acts.value);
@@ -97,7 +97,7 @@ impl Collector {
             }
             std::mem::swap(&mut self.obs, &mut self.result.obs);
         }
-        let values = actor.values(&extra.1);
+        let values = policy.values(&extra.1)?;
         extra.0.iter().zip(values).for_each(|(&k, v)| out.next_value[k] = v);
         for (v, end) in out.next_value.iter_mut().zip(&out.terminated) {
             if *end {
@@ -184,14 +184,14 @@ impl Acts {
 }
 
 /// The first episode of every environment after a reset from `seed`; with the policy's noise or with its mean alone.
-pub fn test_episodes(env: &mut dyn VecEnv, actor: &Actor, seed: u64, noise: bool) -> Result<Vec<Episode>> {
+pub fn test_episodes(env: &mut dyn VecEnv, policy: &Policy, seed: u64, noise: bool) -> Result<Vec<Episode>> {
     let (envs, figures) = (env.num_envs(), env.spec().episode.len());
     let (mut obs, mut result) = (Vec::new(), StepResult::default());
     let mut running = vec![(0.0, 0); envs];
     let mut done: Vec<Option<Episode>> = vec![None; envs];
     env.reset(seed, &mut obs)?;
     for step in 0.. {
-        let acts = actor.act(&obs);
+        let acts = policy.act(&obs)?;
         let actions = if noise { acts.sample(seed, "test actions", step) } else { acts.mu };
         env.step(&actions, &mut result)?;
         for i in (0..envs).filter(|&i| done[i].is_none()).collect::<Vec<_>>() {

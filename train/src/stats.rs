@@ -1,7 +1,8 @@
 //! Figures of an epoch: gathered, averaged, named.
 
 use crate::collector::{Episode, Rollout};
-use crate::ppo::{Losses, UpdateStats};
+use crate::loss::Losses;
+use crate::ppo::UpdateStats;
 use egogen_envs::EnvSpec;
 use serde::{Deserialize, Serialize};
 

@@ -3,6 +3,7 @@
 use crate::checkpoint::{self, Best, Checkpoint, Description, State};
 use crate::collector::{Collector, test_episodes};
 use crate::logger::{Console, Csv, Logger, TensorBoard};
+use crate::policy::Compute;
 use crate::ppo::Learner;
 use crate::recipe::Plan;
 use crate::registry::Registry;
@@ -14,7 +15,6 @@ use egogen::io::write_atomic;
 use egogen_envs::{ActionSpace, EnvSpec, VecEnv};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
@@ -72,7 +72,7 @@ impl Trainer {
         let made = registry.make(&recipe.env, &recipe.env_options, recipe.run.envs)?;
         let test_env = registry.make(&recipe.env, &recipe.env_options, recipe.test.episodes)?.env;
         let env_spec = made.env.spec().clone();
-        let spec = Arc::new(policy_spec(&plan, &env_spec)?);
+        let spec = policy_spec(&plan, &env_spec)?;
         let mut collector = Collector::new(made.env, recipe.seed)?;
         let (params, adam, state) = match from {
             None => (spec.init(recipe.seed), AdamW::new(spec.params()), State::default()),
@@ -82,10 +82,10 @@ impl Trainer {
                 (c.params, c.adam, c.state)
             }
         };
-        let device = recipe.device.device()?;
+        let compute = Compute::new(recipe.device)?;
         let shards = Shards::new(recipe.run.shards, threads)?;
         Ok(Self {
-            learner: Learner::new(spec, device, shards, params, adam, state.updates),
+            learner: Learner::new(spec, compute, shards, params, adam, state.updates)?,
             dir: dir.into(),
             origin: made.origin,
             env_spec,
@@ -143,7 +143,7 @@ impl Trainer {
     fn update(&mut self, clock: &mut Clock) -> Result<()> {
         let recipe = &self.plan.recipe;
         let start = Instant::now();
-        let rollout = self.collector.collect(&self.learner.actor(), self.plan.horizon)?;
+        let rollout = self.collector.collect(self.learner.policy(), self.plan.horizon)?;
         clock.collect += start.elapsed().as_secs_f64();
         let start = Instant::now();
         let update = self.learner.update(&rollout, recipe.run.envs, &recipe.ppo, &recipe.adam, recipe.seed)?;
@@ -164,7 +164,7 @@ impl Trainer {
         for (prefix, noise) in [("test_sto", true), ("test_det", false)] {
             let mut episodes = Episodes::default();
             if due {
-                episodes.add(&test_episodes(self.test_env.as_mut(), &self.learner.actor(), test.seed, noise)?);
+                episodes.add(&test_episodes(self.test_env.as_mut(), self.learner.policy(), test.seed, noise)?);
             }
             row.extend(episodes.row(prefix, &self.env_spec));
         }

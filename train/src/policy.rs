@@ -1,0 +1,84 @@
+//! The policy as it acts: no gradients, a batch of observations in, plain floats out.
+
+use crate::{Error, Result};
+use burn::tensor::{Device, Tensor};
+use egogen::agent::{Network, PolicySpec};
+use egogen::device::DeviceChoice;
+use egogen::kernels::PolicyEngine;
+
+/// Mean, log variance (n x A each) and value (n) for n observations.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Acts {
+    pub mu: Vec<f32>,
+    pub logvar: Vec<f32>,
+    pub value: Vec<f32>,
+}
+
+/// Who computes: the project's own layers on the processor, or burn on a device.
+#[derive(Clone, Debug)]
+pub enum Compute {
+    Own,
+    Burn(Device),
+}
+
+impl Compute {
+    /// Own layers for the default device, burn for every other.
+    pub fn new(device: DeviceChoice) -> Result<Self> {
+        Ok(if device == DeviceChoice::Flex { Self::Own } else { Self::Burn(device.device()?) })
+    }
+}
+
+/// A policy that acts with fixed parameters.
+pub struct Policy {
+    spec: PolicySpec,
+    acting: Acting,
+}
+
+enum Acting {
+    Own(Box<PolicyEngine>),
+    Burn(Network),
+}
+
+impl Policy {
+    /// The policy with these flat parameters.
+    pub fn new(spec: &PolicySpec, params: &[f32], compute: &Compute) -> Result<Self> {
+        let acting = match compute {
+            Compute::Own => Acting::Own(Box::new(PolicyEngine::new(spec, params)?)),
+            Compute::Burn(device) => Acting::Burn(Network::new(spec, params, device)),
+        };
+        Ok(Self { spec: spec.clone(), acting })
+    }
+
+    /// Means, log variances and values of observation rows.
+    pub fn act(&self, obs: &[f32]) -> Result<Acts> {
+        match &self.acting {
+            Acting::Own(engine) => {
+                let (a, width) = (self.spec.action, engine.output_dim());
+                let mut out = vec![0.0; obs.len() / self.spec.layout.dim() * width];
+                engine.forward(obs, &mut out)?;
+                let columns = |from: usize, to: usize| out.chunks_exact(width).flat_map(|row| &row[from..to]).copied().collect();
+                Ok(Acts { mu: columns(0, a), logvar: columns(a, 2 * a), value: columns(2 * a, width) })
+            }
+            Acting::Burn(network) => {
+                let out = network.forward(obs);
+                Ok(Acts { mu: floats(out.mu)?, logvar: floats(out.logvar)?, value: floats(out.value)? })
+            }
+        }
+    }
+
+    /// Values alone.
+    pub fn values(&self, obs: &[f32]) -> Result<Vec<f32>> {
+        let mut out = vec![0.0; obs.len() / self.spec.layout.dim()];
+        match &self.acting {
+            Acting::Own(engine) => engine.values(obs, &mut out)?,
+            Acting::Burn(network) if !out.is_empty() => out = floats(network.value(obs))?,
+            Acting::Burn(_) => {}
+        }
+        Ok(out)
+    }
+}
+
+/// The tensor's floats, row-major.
+pub(crate) fn floats<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>> {
+    tensor.into_data().try_to_vec::<f32>().map_err(|e| Error::run(format!("the device returned no 32-bit floats: {e:?}")))
+}

@@ -189,7 +189,7 @@ mod tests {
             let (mut out, mut values) = (vec![f32::NAN; people * 13], vec![f32::NAN; people]);
             engine.forward(&obs, &mut out).unwrap();
             engine.values(&obs, &mut values).unwrap();
-            let want = Network::new(std::sync::Arc::new(spec.clone()), &flat, &burn::tensor::Device::flex()).forward(&obs);
+            let want = Network::new(&spec, &flat, &burn::tensor::Device::flex()).forward(&obs);
             let floats = |data: burn::tensor::TensorData| data.try_to_vec::<f32>().unwrap();
             let (mu, logvar, value) = (floats(want.mu.into_data()), floats(want.logvar.into_data()), floats(want.value.into_data()));
             let close = |a: f32, b: f32| assert!((a - b).abs() < 2e-5 * (1.0 + b.abs()), "{a}, burn says {b}");

@@ -64,6 +64,8 @@ pub struct State {
     pub env_steps: u64,
     pub adam_steps: u64,
     pub best: Option<Best>,
+    /// Figures of the last test.
+    pub last_test: BTreeMap<String, f64>,
     /// Sums of the begun epoch.
     pub stats: EpochStats,
     /// What [`crate::Collector::save`] wrote.

@@ -99,7 +99,13 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
     };
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
-    ctrlc::set_handler(move || flag.store(true, Ordering::SeqCst)).map_err(|e| Error::run(format!("cannot watch for Ctrl-C: {e}")))?;
+    ctrlc::set_handler(move || {
+        // The second time, at once.
+        if flag.swap(true, Ordering::SeqCst) {
+            std::process::exit(i32::from(INTERRUPTED));
+        }
+    })
+    .map_err(|e| Error::run(format!("cannot watch for Ctrl-C: {e}")))?;
     match trainer.run(&stop)? {
         Outcome::Finished => Ok(0),
         Outcome::Interrupted => {

@@ -27,3 +27,10 @@ pub use optim::{AdamConfig, AdamW, clip_scale, global_norm};
 pub use policy::{Acts, Compute, Policy};
 pub use ppo::{Learner, PpoConfig, UpdateStats};
 pub use shards::Shards;
+
+/// Numbers from PyTorch and NumPy, made by tests/tools/ppo/make.py.
+#[cfg(test)]
+fn fixture() -> egogen::io::Tensors {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/fixtures/ppo.safetensors");
+    egogen::io::Tensors::read(path).expect("the fixture is in the repository")
+}

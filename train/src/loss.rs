@@ -221,3 +221,89 @@ fn normalise(values: &[f32]) -> Vec<f32> {
     let std = (square / (n - 1.0).max(1.0)).sqrt();
     values.iter().map(|&x| ((f64::from(x) - mean) / (std + 1e-8)) as f32).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Policy;
+    use egogen::DeviceChoice;
+    use egogen::agent::{ObsGroup, ObsLayout};
+    use egogen::io::{Precision, Tensors, pack_tensors};
+    use std::collections::BTreeMap;
+
+    struct Case {
+        spec: PolicySpec,
+        params: Vec<f32>,
+        grads: Vec<f32>,
+        batch: Batch,
+        /// policy, value, entropy, KL to the prior, approximate KL, clip fraction
+        figures: Vec<f32>,
+        outputs: [Vec<f32>; 3],
+    }
+
+    const ROWS: usize = 13;
+
+    fn case(name: &str, trunk: Option<usize>) -> Case {
+        let t = crate::fixture();
+        let group = |name: &str, shape: &[usize]| ObsGroup { name: name.into(), shape: shape.into() };
+        let layout = ObsLayout::new(vec![group("state", &[2, 7]), group("rays", &[3, 4]), group("dist", &[1]), group("plain", &[3])]);
+        let config = serde_json::json!({"gru": {"state": 6, "rays": 5}, "octaves": 3, "trunk": trunk, "logvar": [-0.15, 0.15]});
+        let spec = PolicySpec::new(serde_json::from_value(config).unwrap(), layout, 4).unwrap();
+        let flat = |what: &str| {
+            let prefix = format!("{name}.{what}/");
+            let names: Vec<_> = t.names().into_iter().filter(|n| n.starts_with(&prefix)).collect();
+            let tensors: Vec<_> = names
+                .iter()
+                .map(|n| {
+                    let shape = t.shape(n).unwrap();
+                    (n[prefix.len()..].to_string(), shape.clone(), t.f32s(n, &shape).unwrap())
+                })
+                .collect();
+            let bytes = pack_tensors(&tensors, &BTreeMap::new(), Precision::Full).unwrap();
+            spec.from_tensors(&Tensors::from_bytes(what, bytes).unwrap()).unwrap()
+        };
+        let get = |what: &str, shape: &[usize]| t.f32s(&format!("{name}.{what}"), shape).unwrap();
+        let batch = Batch {
+            obs: get("obs", &[ROWS, 30]),
+            actions: get("action", &[ROWS, 4]),
+            old_log_prob: get("old", &[ROWS]),
+            advantage: get("advantage", &[ROWS]),
+            returns: get("returns", &[ROWS]),
+        };
+        let outputs = [get("mu", &[ROWS, 4]), get("logvar", &[ROWS, 4]), get("value", &[ROWS])];
+        Case { params: flat("param"), grads: flat("grad"), batch, figures: get("figures", &[6]), outputs, spec }
+    }
+
+    fn assert_close(have: &[f32], want: &[f32], what: &str) {
+        assert_eq!(have.len(), want.len());
+        let scale = want.iter().fold(1.0f32, |m, x| m.max(x.abs()));
+        for (i, (h, w)) in have.iter().zip(want).enumerate() {
+            assert!((h - w).abs() < 1e-5 * scale, "{what} {i}: {h} against {w}");
+        }
+    }
+
+    #[test]
+    fn losses_and_gradients_agree_with_torch() {
+        let burn = Compute::Burn(DeviceChoice::Flex.device().unwrap());
+        let ppo: PpoConfig = serde_json::from_value(serde_json::json!({
+            "gamma": 0.0, "lambda": 0.0, "clip": 0.2, "value": 0.7, "entropy": 0.05, "kl_prior": 0.4, "max_grad_norm": 1.0,
+            "passes": 1, "batch": ROWS
+        }))
+        .unwrap();
+        for (name, trunk) in [("sum", None), ("project", Some(10))] {
+            let c = case(name, trunk);
+            for (compute, shards) in [(&Compute::Own, 1), (&Compute::Own, 3), (&burn, 1), (&burn, 2)] {
+                let what = format!("{name} {compute:?} {shards}");
+                let acts = Policy::new(&c.spec, &c.params, compute).unwrap().act(&c.batch.obs).unwrap();
+                assert_close(&acts.mu, &c.outputs[0], &what);
+                assert_close(&acts.logvar, &c.outputs[1], &what);
+                assert_close(&acts.value, &c.outputs[2], &what);
+                let shards = Shards::new(shards, 2).unwrap();
+                let (grads, losses, _) = gradients(&c.spec, &c.params, compute, &shards, &c.batch, &ppo).unwrap();
+                assert_close(&grads, &c.grads, &what);
+                let l = [losses.policy, losses.value, losses.entropy, losses.kl_prior, losses.approx_kl, losses.clip_fraction];
+                assert_close(&l.map(|x| x as f32), &c.figures, &what);
+            }
+        }
+    }
+}

@@ -84,3 +84,36 @@ pub fn global_norm(grads: &[f32]) -> f32 {
 pub fn clip_scale(norm: f32, max: f32) -> f32 {
     (max / (norm + 1e-6)).min(1.0)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn agrees_with_torch() {
+        let t = crate::fixture();
+        let config = AdamConfig { lr: 1e-2, betas: betas(), eps: eps(), weight_decay: weight_decay() };
+        let mut params = t.f32s("adam.start", &[11]).unwrap();
+        let mut adam = AdamW::new(11);
+        let (grads, path) = (t.f32s("adam.grads", &[5, 11]).unwrap(), t.f32s("adam.path", &[5, 11]).unwrap());
+        let norms = t.f32s("adam.norms", &[5]).unwrap();
+        assert!(norms[0] < 0.5 && norms[1] > 0.5, "both sides of the clip are wanted");
+        for (step, grads) in grads.chunks(11).enumerate() {
+            let norm = global_norm(grads);
+            assert!((norm - norms[step]).abs() < 1e-5 * norm);
+            adam.step(&config, &mut params, grads, clip_scale(norm, 0.5));
+            for (p, want) in params.iter().zip(&path[step * 11..]) {
+                assert!((p - want).abs() < 2e-6, "step {step}: {p} against {want}");
+            }
+        }
+    }
+
+    #[test]
+    fn one_norm_over_everything() {
+        // |(3, 4, 12)| = 13, scaled down to 1.
+        let norm = global_norm(&[3.0, 4.0, 12.0]);
+        assert_eq!(norm, 13.0);
+        assert!((13.0 * clip_scale(norm, 1.0) - 1.0).abs() < 1e-6);
+        assert_eq!(clip_scale(0.5, 1.0), 1.0);
+    }
+}

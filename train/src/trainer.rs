@@ -56,15 +56,18 @@ pub fn policy_spec(plan: &Plan, env: &EnvSpec) -> Result<PolicySpec> {
 impl Trainer {
     /// Starts a run in the new folder `dir`.
     pub fn start(plan: Plan, registry: &Registry, dir: &Path, threads: usize) -> Result<Self> {
-        write_atomic(dir.join("recipe.toml"), plan.recipe.to_toml()?.as_bytes())?;
-        Self::build(plan, registry, dir, threads, None)
+        Self::build(plan, registry, dir, threads, None)?.note_recipe()
     }
 
     /// Continues the run in `dir` from its newest whole checkpoint.
     pub fn resume(plan: Plan, registry: &Registry, dir: &Path, threads: usize, warn: impl FnMut(String)) -> Result<Self> {
         let from = checkpoint::newest(&dir.join("checkpoints"), warn)?;
-        write_atomic(dir.join("recipe.toml"), plan.recipe.to_toml()?.as_bytes())?;
-        Self::build(plan, registry, dir, threads, Some(from))
+        Self::build(plan, registry, dir, threads, Some(from))?.note_recipe()
+    }
+
+    fn note_recipe(self) -> Result<Self> {
+        write_atomic(self.dir.join("recipe.toml"), self.plan.recipe.to_toml()?.as_bytes())?;
+        Ok(self)
     }
 
     fn build(plan: Plan, registry: &Registry, dir: &Path, threads: usize, from: Option<Checkpoint>) -> Result<Self> {
@@ -73,6 +76,7 @@ impl Trainer {
         let test_env = registry.make(&recipe.env, &recipe.env_options, recipe.test.episodes)?.env;
         let env_spec = made.env.spec().clone();
         let spec = policy_spec(&plan, &env_spec)?;
+        check_best(&recipe.checkpoint.best, &env_spec)?;
         let mut collector = Collector::new(made.env, recipe.seed)?;
         let (params, adam, state) = match from {
             None => (spec.init(recipe.seed), AdamW::new(spec.params()), State::default()),
@@ -95,7 +99,7 @@ impl Trainer {
             env_steps: state.env_steps,
             stats: state.stats,
             best: state.best,
-            last_test: BTreeMap::new(),
+            last_test: state.last_test,
             plan,
         })
     }
@@ -211,6 +215,7 @@ impl Trainer {
                 env_steps: self.env_steps,
                 adam_steps: self.learner.adam().steps,
                 best: self.best.clone(),
+                last_test: self.last_test.clone(),
                 stats: self.stats.clone(),
                 collector: self.collector.save()?,
             },
@@ -261,6 +266,16 @@ fn check_same(d: &Description, spec: &PolicySpec, origin: &BTreeMap<String, Stri
         }
         None => Ok(()),
     }
+}
+
+/// The figure that chooses checkpoints must be one that is reported.
+fn check_best(best: &str, env: &EnvSpec) -> Result<()> {
+    let rows = [EpochStats::default().row(env), Episodes::default().row("test_sto", env), Episodes::default().row("test_det", env)];
+    let names: Vec<String> = rows.into_iter().flatten().map(|(name, _)| name).collect();
+    if names.iter().any(|n| n == best) {
+        return Ok(());
+    }
+    Err(Error::config(format!("checkpoint.best is '{best}', expected one of: {}", names.join(", "))))
 }
 
 /// Wall-clock seconds of an epoch.

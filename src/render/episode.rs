@@ -158,13 +158,11 @@ impl<'a> Episode<'a> {
         let aside = along.perp() * -0.9 - along * 0.45;
         let (low, high) = self.points(tracks).fold((Vec3::MAX, Vec3::MIN), |(l, h), p| (l.min(p), h.max(p)));
         let target = 0.5 * (low + high).with_z(HEAD_ROOM);
+        let size = Vec2::new(width as f32, height as f32);
         let shown = |camera: &Camera| {
-            self.points(tracks).flat_map(|p| [p, p.with_z(HEAD_ROOM)]).all(|p| {
-                camera.project(p).is_some_and(|(uv, _)| {
-                    let margin = Vec2::splat(0.06 * width as f32);
-                    uv.cmpge(margin).all() && (uv + margin).cmple(Vec2::new(width as f32, height as f32)).all()
-                })
-            })
+            self.points(tracks)
+                .flat_map(|p| [p, p.with_z(HEAD_ROOM)])
+                .all(|p| camera.project(p).is_some_and(|(uv, _)| (uv / size - 0.5).abs().max_element() < 0.45))
         };
         let mut distance = 3.0;
         loop {

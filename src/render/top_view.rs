@@ -37,11 +37,12 @@ impl TopView {
         Ok(view)
     }
 
-    /// The smallest rectangle around `points` with `border` metres to spare; a unit square for no points.
+    /// The rectangle around `points` with `border` metres to spare, not higher than wide; a unit square for no points.
     pub fn around(points: impl IntoIterator<Item = Vec2>, border: f32, width: usize) -> Result<Self> {
         let (low, high) = points.into_iter().fold((Vec2::MAX, Vec2::MIN), |(l, h), p| (l.min(p), h.max(p)));
         let (low, high) = if low.x > high.x { (Vec2::ZERO, Vec2::ONE) } else { (low, high) };
-        Self::new(low - border, high + border, width)
+        let side = Vec2::new(0.5 * (high.y - low.y - high.x + low.x).max(0.0), 0.0);
+        Self::new(low - border - side, high + border + side, width)
     }
 
     /// Pixel position of the world point `p`.
@@ -158,5 +159,8 @@ mod tests {
         assert!(TopView::new(Vec2::ZERO, Vec2::new(1.0, 1e6), 400).is_err());
         assert!(TopView::new(Vec2::ZERO, Vec2::splat(f32::NAN), 400).is_err());
         assert!(TopView::around([], 0.5, 400).is_ok());
+        // A way of 1 x 9 m is shown on 10 x 10 m.
+        let tall = TopView::around([Vec2::ZERO, Vec2::new(1.0, 9.0)], 0.5, 448).unwrap();
+        assert_eq!((tall.low, tall.scale), (Vec2::new(-4.5, -0.5), 40.0));
     }
 }

@@ -2,6 +2,7 @@
 //!
 //! The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217.
 
+use super::mend::mend_root;
 use crate::{Error, Result};
 use glam::{Quat, Vec3};
 use std::fs;
@@ -86,7 +87,7 @@ impl SourceFrame {
     }
 }
 
-/// Reads an exponential-map file; its first row is a T-pose and is dropped.
+/// Reads an exponential-map file; its first row is a T-pose and is dropped, and the root's rotation is mended ([`super::mend`]).
 ///
 /// The files hold rotations for row vectors, `G_j = R(e_j) G_parent`, so the rotation of column vectors is about `-e_j`.
 pub fn read_expmap(path: impl AsRef<Path>, name: &str) -> Result<SourceClip> {
@@ -100,6 +101,7 @@ pub fn read_expmap(path: impl AsRef<Path>, name: &str) -> Result<SourceClip> {
         return Err(Error::file(path, format!("holds {} rows, expected a T-pose row and at least one frame", frames.len())));
     }
     frames.remove(0);
+    mend_root(&mut frames);
     Ok(SourceClip { name: name.to_string(), fps: SOURCE_FPS, frames })
 }
 

@@ -19,8 +19,6 @@ use std::path::{Path, PathBuf};
 const WALKS: [&str; 4] = ["test/walking", "test/walking_extra", "train/walking", "train/walking_extra"];
 /// BVH files that are used. 131 is a dance with stretched arms, 02_01 stands too high, 01_01 and 05_01 are no locomotion.
 const BVHS: [&str; 1] = ["16_11"];
-/// Clips in which no proper stance is found.
-const DROPPED: [&str; 2] = ["train/walking_extra/walking_25", "train/walking_extra/walking_26"];
 /// Clips kept from training: seven straight walks and a turning one.
 const HELD_OUT: [&str; 8] = [
     "test/walking_extra/walking_10",
@@ -114,10 +112,7 @@ fn read_sources(data_dir: &Path) -> Result<Vec<SourceClip>> {
     let mut clips = Vec::new();
     for set in WALKS {
         for (path, stem) in sorted_files(&root.join("cmu_expmap").join(set), "txt")? {
-            let name = format!("{set}/{stem}");
-            if !DROPPED.contains(&name.as_str()) {
-                clips.push(read_expmap(path, &name)?);
-            }
+            clips.push(read_expmap(path, &format!("{set}/{stem}"))?);
         }
     }
     for name in BVHS {

@@ -7,6 +7,7 @@ pub mod cmu;
 pub mod dataset;
 pub mod footlock;
 pub mod ik;
+mod mend;
 mod net;
 mod predictor;
 pub mod primitive;

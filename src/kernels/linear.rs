@@ -2,6 +2,7 @@
 
 use super::simd::{self, GROUP, Isa, Lane, PANEL};
 use crate::{Error, Result};
+use rayon::prelude::*;
 
 /// Activation applied to every output of a layer.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -99,11 +100,14 @@ impl Linear {
         }
         let (inputs, panels) = (columns.len(), outputs.div_ceil(PANEL));
         let mut layer = Self { inputs, outputs, weight: vec![Lane([0.0; PANEL]); panels * inputs], bias: vec![Lane([0.0; PANEL]); panels] };
-        for (o, w) in weight.chunks_exact(row).enumerate() {
-            for (k, v) in w[columns.clone()].iter().enumerate() {
-                layer.weight[o / PANEL * inputs + k].0[o % PANEL] = *v;
+        // A panel reads 32 rows side by side and writes in order; the policy's 50 MB are packed anew after every update.
+        layer.weight.par_chunks_exact_mut(inputs).zip(weight.par_chunks(PANEL * row)).for_each(|(panel, rows)| {
+            for (lane, k) in panel.iter_mut().zip(columns.clone()) {
+                for (v, row) in lane.0.iter_mut().zip(rows.chunks_exact(row)) {
+                    *v = row[k];
+                }
             }
-        }
+        });
         for (o, b) in bias.iter().enumerate() {
             layer.bias[o / PANEL].0[o % PANEL] = *b;
         }

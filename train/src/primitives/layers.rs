@@ -3,7 +3,8 @@
 //! Weight gradients of a layer used at every frame are taken once, as one product over all frames and people: several times
 //! less work than an autodiff graph over the frames, which the tests compare with.
 
-use egogen::kernels::{Activation, Mat, product};
+use egogen::Result;
+use egogen::kernels::{Activation, Linear, Mat, Source, View, ViewMut, product};
 use egogen::motion::{Dense, Gru};
 
 /// Applies tanh to every value.
@@ -61,6 +62,54 @@ pub fn dense_grad(grad: &mut Dense, dy: &[f32], x: &[f32]) {
     add_rows(dy, &mut grad.bias);
 }
 
+/// A product used at every frame, packed once per update for both directions.
+pub struct Packed {
+    forward: Linear,
+    backward: Linear,
+}
+
+impl Packed {
+    /// y = x W^T + b with the columns `first..first + width` of `weight` (rows of `stride`).
+    pub fn new(weight: &[f32], bias: &[f32], stride: usize, first: usize, width: usize) -> Result<Self> {
+        let rows = weight.len() / stride;
+        let mut transposed = vec![0.0; rows * width];
+        for (o, row) in weight.chunks_exact(stride).enumerate() {
+            for (i, w) in row[first..first + width].iter().enumerate() {
+                transposed[i * rows + o] = *w;
+            }
+        }
+        Ok(Self {
+            forward: Linear::from_columns(weight, bias, stride, first..first + width)?,
+            backward: Linear::new(&transposed, &[], rows)?,
+        })
+    }
+
+    pub fn dense(layer: &Dense) -> Result<Self> {
+        Self::new(&layer.weight, &layer.bias, layer.input, 0, layer.input)
+    }
+
+    /// The state's part of a GRU.
+    pub fn hidden(gru: &Gru) -> Result<Self> {
+        Self::new(&gru.weight_hh, &gru.bias_hh, gru.hidden, 0, gru.hidden)
+    }
+
+    /// y = f(x W^T + b), or y += that.
+    pub fn apply(&self, x: &[f32], y: &mut [f32], add: bool, activation: Activation) {
+        run(&self.forward, x, y, add, activation);
+    }
+
+    /// dx = dy W, or dx += dy W.
+    pub fn back(&self, dy: &[f32], dx: &mut [f32], add: bool) {
+        run(&self.backward, dy, dx, add, Activation::None);
+    }
+}
+
+fn run(layer: &Linear, x: &[f32], y: &mut [f32], add: bool, activation: Activation) {
+    let source = if add { Source::Residual } else { Source::Fresh };
+    let rows = x.len() / layer.inputs();
+    layer.forward(rows, View::new(x, layer.inputs()), ViewMut::new(y, layer.outputs()), source, activation);
+}
+
 /// What a GRU keeps of `steps` steps of `rows` people for its backward pass.
 #[derive(Default)]
 pub struct GruTape {
@@ -84,13 +133,13 @@ impl GruTape {
     }
 
     /// Step `t` of `rows` people. `self.input` at `t` must hold W x + b.
-    pub fn step(&mut self, gru: &Gru, rows: usize, t: usize) {
-        let (h, n) = (gru.hidden, rows * gru.hidden);
+    pub fn step(&mut self, weights: &Packed, rows: usize, t: usize) {
+        let h = weights.forward.inputs();
+        let n = rows * h;
         let (before, after) = self.states.split_at_mut((t + 1) * n);
         let before = &before[t * n..];
         let hidden = &mut self.hidden[t * 3 * n..(t + 1) * 3 * n];
-        fill_rows(&gru.bias_hh, hidden);
-        product(Mat::new(before, rows, h), Mat::new(&gru.weight_hh, 3 * h, h).t(), hidden, 3 * h, true);
+        weights.apply(before, hidden, false, Activation::None);
         let input = &self.input[t * 3 * n..(t + 1) * 3 * n];
         let gates = &mut self.gates[t * 4 * n..(t + 1) * 4 * n];
         for (i, gates) in gates.chunks_exact_mut(4 * h).enumerate() {
@@ -115,8 +164,9 @@ impl GruTape {
 
     /// Backward through step `t`: `d` (rows x H) goes from the gradient of the state after to that of the state before.
     /// Leaves the gradients of both shares of the gates in `input` and `hidden` at `t`.
-    pub fn step_back(&mut self, gru: &Gru, rows: usize, t: usize, d: &mut [f32]) {
-        let (h, n) = (gru.hidden, rows * gru.hidden);
+    pub fn step_back(&mut self, weights: &Packed, rows: usize, t: usize, d: &mut [f32]) {
+        let h = weights.forward.inputs();
+        let n = rows * h;
         let before = &self.states[t * n..(t + 1) * n];
         let gates = &self.gates[t * 4 * n..(t + 1) * 4 * n];
         let input = &mut self.input[t * 3 * n..(t + 1) * 3 * n];
@@ -138,7 +188,7 @@ impl GruTape {
             dhn[..h].copy_from_slice(dr);
             dhn[h..2 * h].copy_from_slice(dz);
         }
-        product(Mat::new(hidden, rows, 3 * h), Mat::new(&gru.weight_hh, 3 * h, h), d, h, true);
+        weights.back(hidden, d, true);
     }
 
     /// Adds the gradients of the state's weights over all steps.
@@ -150,7 +200,7 @@ impl GruTape {
     }
 
     /// Runs a whole sequence `x` (steps x rows x I) from the zero state; returns the last state.
-    pub fn run(&mut self, gru: &Gru, x: &[f32], rows: usize) -> &[f32] {
+    pub fn run(&mut self, gru: &Gru, packed: &Packed, x: &[f32], rows: usize) -> &[f32] {
         let (h, steps) = (gru.hidden, x.len() / (rows * gru.input));
         self.reset(h, rows, steps);
         self.states[..rows * h].fill(0.0);
@@ -158,20 +208,21 @@ impl GruTape {
         let weight = Mat::new(&gru.weight_ih, 3 * h, gru.input).t();
         product(Mat::new(x, steps * rows, gru.input), weight, &mut self.input, 3 * h, true);
         for t in 0..steps {
-            self.step(gru, rows, t);
+            self.step(packed, rows, t);
         }
         &self.states[steps * rows * h..]
     }
 
     /// Backward through [`GruTape::run`]; `d` is the gradient of the last state and is used up.
-    pub fn run_back(&mut self, gru: &Gru, grad: &mut Gru, x: &[f32], rows: usize, d: &mut [f32]) {
-        let (h, steps) = (gru.hidden, x.len() / (rows * gru.input));
+    pub fn run_back(&mut self, packed: &Packed, grad: &mut Gru, x: &[f32], rows: usize, d: &mut [f32]) {
+        let (h, width) = (grad.hidden, grad.input);
+        let steps = x.len() / (rows * width);
         for t in (0..steps).rev() {
-            self.step_back(gru, rows, t, d);
+            self.step_back(packed, rows, t, d);
         }
         self.hidden_grad(grad, rows, steps);
-        let x = Mat::new(x, steps * rows, gru.input);
-        product(Mat::new(&self.input, steps * rows, 3 * h).t(), x, &mut grad.weight_ih, gru.input, true);
+        let x = Mat::new(x, steps * rows, width);
+        product(Mat::new(&self.input, steps * rows, 3 * h).t(), x, &mut grad.weight_ih, width, true);
         add_rows(&self.input, &mut grad.bias_ih);
     }
 }

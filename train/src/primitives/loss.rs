@@ -1,7 +1,8 @@
 //! The predictor's loss and its gradient.
 
-use super::predictor::{Batch, Tape};
+use super::predictor::{Batch, Ready, Tape};
 use egogen::body::FOOT_MARKERS;
+use egogen::metrics::kl_to_standard;
 use egogen::motion::PredictorWeights;
 use serde::{Deserialize, Serialize};
 
@@ -53,18 +54,11 @@ fn kl_term(kl: f32, robust: bool) -> (f32, f32) {
 }
 
 /// Loss of a whole batch, run as one: forward, then (if `grad`) backward with gradients added to it.
-pub fn step(
-    w: &PredictorWeights,
-    grad: &mut PredictorWeights,
-    tape: &mut Tape,
-    batch: &Batch,
-    weights: &LossWeights,
-    share: f32,
-) -> LossParts {
+pub fn step(w: &Ready, grad: &mut PredictorWeights, tape: &mut Tape, batch: &Batch, weights: &LossWeights, share: f32) -> LossParts {
     forward(w, tape, batch);
     let mut d_frames = Vec::new();
     let mut parts = frame_loss(&tape.frames, batch, weights, share, &mut d_frames);
-    parts.kl = mean_kl(&tape.mu, &tape.logvar);
+    parts.kl = kl_to_standard(&tape.mu, &tape.logvar) / tape.mu.len() as f32;
     // The robust form couples all people of a batch; taking each shard's own mean keeps shards independent.
     let slope = share * weights.kl * kl_term(parts.kl, weights.robust).1 / tape.mu.len() as f32;
     let mut d_mu: Vec<f32> = tape.mu.iter().map(|m| slope * m).collect();
@@ -74,17 +68,11 @@ pub fn step(
 }
 
 /// Encodes, draws the latent mu + exp(logvar / 2) eps, decodes.
-pub fn forward(w: &PredictorWeights, tape: &mut Tape, batch: &Batch) {
+pub fn forward(w: &Ready, tape: &mut Tape, batch: &Batch) {
     tape.encode(w, &batch.seed, batch.future(), batch.rows);
     let z: Vec<f32> = tape.mu.iter().zip(&tape.logvar).zip(&batch.eps).map(|((m, v), e)| m + (0.5 * v).exp() * e).collect();
     let frame = batch.seed.len() / (2 * batch.rows);
     tape.decode(w, &batch.seed, &z, batch.rows, batch.target.len() / (batch.rows * frame) - 1);
-}
-
-/// KL divergence from the standard normal, mean over people and dimensions.
-pub fn mean_kl(mu: &[f32], logvar: &[f32]) -> f32 {
-    let sum: f64 = mu.iter().zip(logvar).map(|(m, v)| 0.5 * (m * m + v.exp() - 1.0 - v) as f64).sum();
-    (sum / mu.len() as f64) as f32
 }
 
 /// The terms on the predicted frames; `d` becomes their gradient (steps x rows x frame), scaled by `share`.
@@ -200,7 +188,7 @@ mod tests {
             let (want, mut want_g) = reference(&w, &b, &weights, steps);
             let mut g = w.zeros();
             let mut tape = Tape::default();
-            let parts = step(&w, &mut g, &mut tape, &b, &weights, 1.0);
+            let parts = step(&Ready::new(&w).unwrap(), &mut g, &mut tape, &b, &weights, 1.0);
             assert!((parts.total(&weights) - want).abs() < 1e-5, "{parts:?} {want}");
             for ((name, _, _), (a, b)) in w.named().iter().zip(g.tensors_mut().into_iter().zip(want_g.tensors_mut())) {
                 let scale = b.iter().fold(0.0f32, |m, v| m.max(v.abs()));

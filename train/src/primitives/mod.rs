@@ -1,6 +1,13 @@
 //! Training and evaluation of the motion-primitive model.
 
+pub mod adam;
+pub mod eval;
+pub mod fit;
 pub mod init;
 pub mod layers;
 pub mod loss;
 pub mod predictor;
+pub mod progress;
+pub mod regressor;
+pub mod sample;
+pub mod seeds;

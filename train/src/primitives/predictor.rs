@@ -1,8 +1,34 @@
 //! Forward and backward pass of the marker predictor.
 
-use super::layers::{GruTape, add_rows, dense, dense_back, dense_grad, dense_into, fill_rows, tanh, tanh_back};
-use egogen::kernels::{Mat, product};
+use super::layers::{GruTape, Packed, add_rows, dense, dense_back, dense_grad, fill_rows, tanh, tanh_back};
+use egogen::Result;
+use egogen::kernels::{Activation, Mat, product};
 use egogen::motion::PredictorWeights;
+use rayon::join;
+
+/// Weights, with those that are used at every frame packed for both directions.
+pub struct Ready<'a> {
+    w: &'a PredictorWeights,
+    x_enc: Packed,
+    e_rnn: Packed,
+    d_rnn: Packed,
+    /// The part of the cell's input that is the previous frame.
+    frame: Packed,
+    d_mlp: [Packed; 2],
+    d_out: Packed,
+}
+
+impl<'a> Ready<'a> {
+    pub fn new(w: &'a PredictorWeights) -> Result<Self> {
+        let cell = &w.d_rnn;
+        let f = w.d_out.output;
+        let frame = || Packed::new(&cell.weight_ih, &[], cell.input, cell.input - f, f);
+        let ((x_enc, d_out), (e_rnn, frame)) =
+            join(|| join(|| Packed::hidden(&w.x_enc), || Packed::dense(&w.d_out)), || join(|| Packed::hidden(&w.e_rnn), frame));
+        let (d_rnn, (first, second)) = join(|| Packed::hidden(cell), || join(|| Packed::dense(&w.d_mlp[0]), || Packed::dense(&w.d_mlp[1])));
+        Ok(Self { w, x_enc: x_enc?, e_rnn: e_rnn?, d_rnn: d_rnn?, frame: frame?, d_mlp: [first?, second?], d_out: d_out? })
+    }
+}
 
 /// Everything one forward pass leaves behind; reused from batch to batch. Time outermost, then people.
 #[derive(Default)]
@@ -28,10 +54,11 @@ pub struct Tape {
 
 impl Tape {
     /// Encodes seed `x` (2 x rows x frame) and future `y` (steps x rows x frame) to `mu` and `logvar`.
-    pub fn encode(&mut self, w: &PredictorWeights, x: &[f32], y: &[f32], rows: usize) {
+    pub fn encode(&mut self, p: &Ready, x: &[f32], y: &[f32], rows: usize) {
+        let w = p.w;
         let h = w.x_enc.hidden;
-        let hx = self.x.run(&w.x_enc, x, rows);
-        let hy = self.y.run(&w.e_rnn, y, rows);
+        let hx = self.x.run(&w.x_enc, &p.x_enc, x, rows);
+        let hy = self.y.run(&w.e_rnn, &p.e_rnn, y, rows);
         self.encoded.clear();
         for i in 0..rows {
             self.encoded.extend_from_slice(&hx[i * h..(i + 1) * h]);
@@ -48,7 +75,8 @@ impl Tape {
 
     /// Decodes `steps` frames from seed `x` (2 x rows x frame) and `z` (rows x latent) into `frames`. The seed's state must be
     /// there from [`Tape::encode`].
-    pub fn decode(&mut self, w: &PredictorWeights, x: &[f32], z: &[f32], rows: usize, steps: usize) {
+    pub fn decode(&mut self, p: &Ready, x: &[f32], z: &[f32], rows: usize, steps: usize) {
+        let w = p.w;
         let (h, f, latent) = (w.d_rnn.hidden, w.d_out.output, w.e_mu.output);
         let (wide, inputs) = (h + latent, w.d_rnn.input);
         let hx = &self.x.states[2 * rows * h..];
@@ -76,47 +104,38 @@ impl Tape {
         let [d0, d1] = &mut self.d;
         d0.resize(steps * rows * w.d_mlp[0].output, 0.0);
         d1.resize(steps * rows * h, 0.0);
-        let from_frame = Mat::strided(&w.d_rnn.weight_ih[wide..], 3 * h, f, inputs).t();
         for t in 0..steps {
             let (done, next) = self.frames.split_at_mut((t + 1) * rows * f);
             let frame = &done[t * rows * f..];
             let input = &mut self.cell.input[t * rows * 3 * h..(t + 1) * rows * 3 * h];
             input.copy_from_slice(&self.share);
-            product(Mat::new(frame, rows, f), from_frame, input, 3 * h, true);
-            self.cell.step(&w.d_rnn, rows, t);
+            p.frame.apply(frame, input, true, Activation::None);
+            self.cell.step(&p.d_rnn, rows, t);
             let n0 = rows * w.d_mlp[0].output;
             let (d0, d1) = (&mut d0[t * n0..(t + 1) * n0], &mut d1[t * rows * h..(t + 1) * rows * h]);
-            dense_into(&w.d_mlp[0], &self.cell.states[(t + 1) * rows * h..(t + 2) * rows * h], d0);
-            tanh(d0);
-            dense_into(&w.d_mlp[1], d0, d1);
-            tanh(d1);
+            p.d_mlp[0].apply(&self.cell.states[(t + 1) * rows * h..(t + 2) * rows * h], d0, false, Activation::Tanh);
+            p.d_mlp[1].apply(d0, d1, false, Activation::Tanh);
             let next = &mut next[..rows * f];
-            dense_into(&w.d_out, d1, next);
-            for (n, p) in next.iter_mut().zip(frame) {
-                *n += p;
-            }
+            next.copy_from_slice(frame);
+            p.d_out.apply(d1, next, true, Activation::None);
         }
-    }
-
-    /// Encodes the seed alone, for decoding without a target.
-    pub fn encode_seed(&mut self, w: &PredictorWeights, x: &[f32], rows: usize) {
-        self.x.run(&w.x_enc, x, rows);
     }
 
     /// Adds all weight gradients. `d_frames` (steps x rows x frame) is the loss's gradient with respect to the predicted
     /// frames, used up; `d_mu`, `d_logvar` its direct gradients with respect to those; `eps` the noise that made the latent.
     pub fn backward(
         &mut self,
-        w: &PredictorWeights,
+        p: &Ready,
         g: &mut PredictorWeights,
         batch: &Batch,
         d_frames: &mut [f32],
         d_mu: &mut [f32],
         d_logvar: &mut [f32],
     ) {
+        let w = p.w;
         let (h, rows, latent) = (w.d_rnn.hidden, batch.rows, w.e_mu.output);
         let mut d_hx = vec![0.0; rows * h];
-        let d_constant = self.decoder_back(w, g, d_frames, rows, &mut d_hx);
+        let d_constant = self.decoder_back(p, g, d_frames, rows, &mut d_hx);
         for (i, row) in d_constant.chunks_exact(h + latent).enumerate() {
             add_rows(&row[..h], &mut d_hx[i * h..(i + 1) * h]);
             for (k, dz) in row[h..].iter().enumerate() {
@@ -125,18 +144,12 @@ impl Tape {
                 d_logvar[j] += 0.5 * dz * batch.eps[j] * (0.5 * self.logvar[j]).exp();
             }
         }
-        self.encoder_back(w, g, batch, d_mu, d_logvar, d_hx);
+        self.encoder_back(p, g, batch, d_mu, d_logvar, d_hx);
     }
 
     /// Backward through the decoder; returns the gradient of its constant input and adds to that of the seed's state.
-    fn decoder_back(
-        &mut self,
-        w: &PredictorWeights,
-        g: &mut PredictorWeights,
-        d_frames: &mut [f32],
-        rows: usize,
-        d_hx: &mut [f32],
-    ) -> Vec<f32> {
+    fn decoder_back(&mut self, p: &Ready, g: &mut PredictorWeights, d_frames: &mut [f32], rows: usize, d_hx: &mut [f32]) -> Vec<f32> {
+        let w = p.w;
         let (h, f) = (w.d_rnn.hidden, w.d_out.output);
         let (wide, inputs, steps) = (h + w.e_mu.output, w.d_rnn.input, d_frames.len() / (rows * f));
         let n0 = w.d_mlp[0].output;
@@ -147,19 +160,18 @@ impl Tape {
         d1.resize(steps * rows * h, 0.0);
         d_state.resize(rows * h, 0.0);
         d_state.fill(0.0);
-        let from_frame = Mat::strided(&w.d_rnn.weight_ih[wide..], 3 * h, f, inputs);
         for t in (0..steps).rev() {
             let d = &mut d_frames[t * rows * f..(t + 1) * rows * f];
             add_rows(carry, d);
             let (d0, d1) = (&mut d0[t * rows * n0..(t + 1) * rows * n0], &mut d1[t * rows * h..(t + 1) * rows * h]);
-            dense_back(&w.d_out, d, d1, false);
+            p.d_out.back(d, d1, false);
             tanh_back(&self.d[1][t * rows * h..(t + 1) * rows * h], d1);
-            dense_back(&w.d_mlp[1], d1, d0, false);
+            p.d_mlp[1].back(d1, d0, false);
             tanh_back(&self.d[0][t * rows * n0..(t + 1) * rows * n0], d0);
-            dense_back(&w.d_mlp[0], d0, d_state, true);
-            self.cell.step_back(&w.d_rnn, rows, t, d_state);
+            p.d_mlp[0].back(d0, d_state, true);
+            self.cell.step_back(&p.d_rnn, rows, t, d_state);
             carry.copy_from_slice(d);
-            product(Mat::new(&self.cell.input[t * rows * 3 * h..], rows, 3 * h), from_frame, carry, f, true);
+            p.frame.back(&self.cell.input[t * rows * 3 * h..(t + 1) * rows * 3 * h], carry, true);
         }
         dense_grad(&mut g.d_out, d_frames, &self.d[1]);
         dense_grad(&mut g.d_mlp[1], d1, &self.d[0]);
@@ -187,15 +199,8 @@ impl Tape {
         d_constant
     }
 
-    fn encoder_back(
-        &mut self,
-        w: &PredictorWeights,
-        g: &mut PredictorWeights,
-        batch: &Batch,
-        d_mu: &[f32],
-        d_logvar: &[f32],
-        mut d_hx: Vec<f32>,
-    ) {
+    fn encoder_back(&mut self, p: &Ready, g: &mut PredictorWeights, batch: &Batch, d_mu: &[f32], d_logvar: &[f32], mut d_hx: Vec<f32>) {
+        let w = p.w;
         let (h, rows) = (w.d_rnn.hidden, batch.rows);
         dense_grad(&mut g.e_mu, d_mu, &self.e[1]);
         dense_grad(&mut g.e_logvar, d_logvar, &self.e[1]);
@@ -215,8 +220,8 @@ impl Tape {
             add_rows(&row[..h], &mut d_hx[i * h..(i + 1) * h]);
             d_hy[i * h..(i + 1) * h].copy_from_slice(&row[h..]);
         }
-        self.y.run_back(&w.e_rnn, &mut g.e_rnn, batch.future(), rows, &mut d_hy);
-        self.x.run_back(&w.x_enc, &mut g.x_enc, &batch.seed, rows, &mut d_hx);
+        self.y.run_back(&p.e_rnn, &mut g.e_rnn, batch.future(), rows, &mut d_hy);
+        self.x.run_back(&p.x_enc, &mut g.x_enc, &batch.seed, rows, &mut d_hx);
     }
 }
 

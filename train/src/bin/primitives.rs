@@ -1,0 +1,151 @@
+//! Trains and judges the motion-primitive model.
+
+use anyhow::{Context, Result};
+use clap::{Args, Parser, Subcommand};
+use egogen::body::BodyModel;
+use egogen::io::write_atomic;
+use egogen::kernels::MotionEngine;
+use egogen::motion::{self, MotionSet, MotionWeights};
+use egogen::sim::Sim;
+use egogen_train::primitives::eval::{Effort, evaluate};
+use egogen_train::primitives::fit::{Outcome, Run, Settings};
+use egogen_train::primitives::seeds::make_seeds;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Trains and judges the motion-primitive model.
+#[derive(Parser)]
+#[command(version)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Train the marker predictor and the body regressor, judge them, and write seeds for the walking task.
+    Train(Train),
+    /// Judge a motion model again and write metrics.json into its folder.
+    Eval(Eval),
+    /// Write seeds.safetensors, seeds for the walking task made by the model, into its folder.
+    Seeds(Seeds),
+}
+
+#[derive(Args)]
+struct Eval {
+    #[command(flatten)]
+    data: Data,
+    /// Motion-model folder.
+    #[arg(long, value_name = "DIR")]
+    model: PathBuf,
+    /// People of the prior roll-outs.
+    #[arg(long, default_value_t = EFFORT.people)]
+    people: usize,
+    /// Episodes of the greedy walk.
+    #[arg(long, default_value_t = EFFORT.episodes)]
+    episodes: usize,
+}
+
+#[derive(Args)]
+struct Seeds {
+    #[command(flatten)]
+    data: Data,
+    /// Motion-model folder.
+    #[arg(long, value_name = "DIR")]
+    model: PathBuf,
+}
+
+const EFFORT: Effort = Effort { people: 1000, episodes: 200 };
+
+#[derive(Args)]
+struct Data {
+    /// Folder with the unpacked mocap-cmu archive.
+    #[arg(long, value_name = "DIR")]
+    data: PathBuf,
+    /// Seed of the data's augmentation.
+    #[arg(long, default_value_t = 0)]
+    data_seed: u64,
+}
+
+#[derive(Args)]
+struct Train {
+    #[command(flatten)]
+    data: Data,
+    /// Folder for weights, training state, curves and figures.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Train by the clock for this long instead of by the number of updates.
+    #[arg(long)]
+    minutes: Option<f64>,
+    /// Root of all random streams.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Weight of the divergence from the prior.
+    #[arg(long)]
+    kl: Option<f32>,
+    /// Weight of the loss against sliding feet.
+    #[arg(long)]
+    skate: Option<f32>,
+    /// Go on from the state in --out, with its settings.
+    #[arg(long)]
+    resume: bool,
+}
+
+fn main() -> Result<ExitCode> {
+    match Cli::parse().command {
+        Command::Train(args) => train(args),
+        Command::Eval(args) => {
+            let body = BodyModel::embedded();
+            let (set, held_out, _) = motion::build(&args.data.data, args.data.data_seed, &body)?;
+            judge(&args.model, &body, &set, &held_out, Effort { people: args.people, episodes: args.episodes })?;
+            Ok(ExitCode::SUCCESS)
+        }
+        Command::Seeds(args) => {
+            let body = BodyModel::embedded();
+            let (set, ..) = motion::build(&args.data.data, args.data.data_seed, &body)?;
+            write_seeds(&args.model, &body, &set)?;
+            Ok(ExitCode::SUCCESS)
+        }
+    }
+}
+
+fn judge(model: &Path, body: &Arc<BodyModel>, set: &MotionSet, held_out: &MotionSet, effort: Effort) -> Result<()> {
+    let report = evaluate(&MotionWeights::load(model)?, body, set, held_out, effort)?;
+    println!("{report}");
+    write_atomic(model.join("metrics.json"), format!("{}\n", serde_json::to_string_pretty(&report)?).as_bytes())?;
+    Ok(())
+}
+
+fn write_seeds(model: &Path, body: &Arc<BodyModel>, set: &MotionSet) -> Result<()> {
+    let sim = Sim::new(body.clone(), Arc::new(MotionEngine::load(model)?));
+    let bank = make_seeds(&sim, set)?;
+    bank.write(model.join("seeds.safetensors"), body)?;
+    eprintln!("{} seeds", bank.seeds.len());
+    Ok(())
+}
+
+fn train(args: Train) -> Result<ExitCode> {
+    let body = BodyModel::embedded();
+    let (set, held_out, report) = motion::build(&args.data.data, args.data.data_seed, &body)?;
+    eprintln!("{report}");
+    let mut run = if args.resume {
+        Run::resume(&set, &body, &args.out)?
+    } else {
+        let mut settings = Settings { seed: args.seed, minutes: args.minutes, ..Default::default() };
+        settings.loss.kl = args.kl.unwrap_or(settings.loss.kl);
+        settings.loss.skate = args.skate.unwrap_or(settings.loss.skate);
+        Run::new(&set, &body, settings, &args.out)
+    };
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = stop.clone();
+    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed)).context("cannot listen for Ctrl-C")?;
+    if run.train(&stop)? == Outcome::Interrupted {
+        eprintln!("interrupted; state saved in {}, go on with --resume", run.folder().display());
+        return Ok(ExitCode::from(130));
+    }
+    write_seeds(run.folder(), &body, &set)?;
+    judge(run.folder(), &body, &set, &held_out, EFFORT)?;
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,0 +1,79 @@
+//! What a run says while it runs: a bar (or lines, away from a terminal) and a CSV file.
+
+use super::fit::Stage;
+use egogen::{Error, Result};
+use indicatif::{ProgressBar, ProgressStyle};
+use std::fs::{File, OpenOptions};
+use std::io::{IsTerminal, Write, stderr};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Time between lines away from a terminal.
+const LINE_EVERY: Duration = Duration::from_secs(15);
+/// Updates between CSV rows.
+const ROW_EVERY: u64 = 20;
+
+/// Progress of one stage.
+pub struct Progress {
+    stage: Stage,
+    names: &'static [&'static str],
+    bar: Option<ProgressBar>,
+    path: PathBuf,
+    file: File,
+    start: Instant,
+    first: f64,
+    line: Instant,
+    /// Running means of the figures.
+    mean: Vec<f64>,
+}
+
+impl Progress {
+    /// Progress of `stage`; appends to `<stage>.csv` in `out` if the stage goes on at `step` > 0.
+    pub fn new(out: &Path, stage: Stage, step: u64) -> Result<Self> {
+        let names: &[&str] = match stage {
+            Stage::Body => &["loss", "marker_distance"],
+            _ => &["reconstruction", "velocity", "kl", "skate"],
+        };
+        let path = out.join(format!("{}.csv", format!("{stage:?}").to_lowercase()));
+        std::fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;
+        let open = OpenOptions::new().create(true).write(true).append(step > 0).truncate(step == 0).open(&path);
+        let mut file = open.map_err(|e| Error::io(&path, e))?;
+        if step == 0 {
+            writeln!(file, "step,rate,{}", names.join(",")).map_err(|e| Error::io(&path, e))?;
+        }
+        let bar = stderr().is_terminal().then(|| {
+            let style = ProgressStyle::with_template("{prefix:8} {wide_bar} {percent}% {msg}").unwrap_or(ProgressStyle::default_bar());
+            ProgressBar::new(1000).with_style(style).with_prefix(format!("{stage:?}"))
+        });
+        let now = Instant::now();
+        Ok(Self { stage, names, bar, path, file, start: now, first: f64::NAN, line: now, mean: Vec::new() })
+    }
+
+    /// Takes note of update `step`; `fraction` of the stage is done.
+    pub fn step(&mut self, step: u64, fraction: f64, rate: f32, figures: &[f32]) -> Result<()> {
+        if self.mean.is_empty() {
+            self.mean = figures.iter().map(|&v| v as f64).collect();
+            self.first = fraction;
+        }
+        self.mean.iter_mut().zip(figures).for_each(|(m, v)| *m += 0.03 * (*v as f64 - *m));
+        if step.is_multiple_of(ROW_EVERY) {
+            let figures: Vec<String> = self.mean.iter().map(|v| format!("{v:.6}")).collect();
+            writeln!(self.file, "{step},{rate:.3e},{}", figures.join(",")).map_err(|e| Error::io(&self.path, e))?;
+        }
+        if let Some(bar) = &self.bar {
+            bar.set_position((1000.0 * fraction) as u64);
+            bar.set_message(self.message(step, fraction));
+        } else if self.line.elapsed() > LINE_EVERY {
+            self.line = Instant::now();
+            eprintln!("{:?} {:3.0}% {}", self.stage, 100.0 * fraction, self.message(step, fraction));
+        }
+        Ok(())
+    }
+
+    fn message(&self, step: u64, fraction: f64) -> String {
+        let left = self.start.elapsed().as_secs_f64() * (1.0 - fraction) / (fraction - self.first).max(1e-9);
+        let figures: Vec<String> = self.names.iter().zip(&self.mean).map(|(n, v)| format!("{n} {v:.5}")).collect();
+        let left = if left < 360_000.0 { format!("{:.0} s", left) } else { "?".into() };
+        format!("update {step}, {}, {left} left", figures.join(", "))
+    }
+}

@@ -1,0 +1,242 @@
+//! Training batches: windows of motion for the predictor, bodies for the regressor.
+
+use super::predictor::Batch;
+use super::regressor::Truth;
+use egogen::body::{BETAS, BodyModel, Frame, MARKER_DIM, PARAMS, ShapedBody, TRANSL, canonical_frame, joint};
+use egogen::kernels::{Decoder, Regressor};
+use egogen::motion::{FRAMES, FUTURE, LATENT, MotionSet, SEED};
+use egogen::rng::{Stream, stream};
+use egogen::{Error, Result};
+use glam::Vec3;
+use rand::RngExt;
+use rand_distr::StandardNormal;
+use rayon::prelude::*;
+
+/// People whose forward and backward pass is one task; a batch is cut into such shards whatever the number of threads.
+pub const SHARD: usize = 32;
+/// Floats of a seed.
+const SEED_DIM: usize = SEED * MARKER_DIM;
+
+/// Standard normal numbers.
+pub fn normals(rng: &mut Stream, n: usize) -> Vec<f32> {
+    (0..n).map(|_| rng.sample(StandardNormal)).collect()
+}
+
+/// Copies row `row` of `rows` of one frame of a time-major array.
+fn put(to: &mut [f32], rows: usize, t: usize, row: usize, frame: &[f32]) {
+    let at = (t * rows + row) * MARKER_DIM;
+    to[at..at + MARKER_DIM].copy_from_slice(frame);
+}
+
+/// A batch of people who each walk through `depth` consecutive primitives of a clip, then start anew.
+pub struct Lanes<'a> {
+    set: &'a MotionSet,
+    windows: Vec<(usize, usize)>,
+    depth: u64,
+    rows: usize,
+    at: Vec<(usize, usize)>,
+    /// rows x 2 x 201: where the predictions led.
+    seeds: Vec<f32>,
+}
+
+impl<'a> Lanes<'a> {
+    /// `rows` people through `depth` primitives each.
+    pub fn new(set: &'a MotionSet, rows: usize, depth: usize) -> Result<Self> {
+        let windows = set.windows(SEED + depth * FUTURE, 1);
+        if windows.is_empty() {
+            return Err(Error::invalid(format!("no clip holds {} frames", SEED + depth * FUTURE)));
+        }
+        Ok(Self { set, windows, depth: depth as u64, rows, at: Vec::new(), seeds: vec![0.0; rows * SEED_DIM] })
+    }
+
+    /// Whether `step` starts anew, so that training may be cut there.
+    pub fn is_start(&self, step: u64) -> bool {
+        step.is_multiple_of(self.depth)
+    }
+
+    /// The shards of step `step`: true futures in the true canonical frames, seeds as the model left them.
+    pub fn batch(&mut self, seed: u64, step: u64) -> Vec<Batch> {
+        let k = step % self.depth;
+        if k == 0 {
+            let rng = &mut stream(seed, "windows", step);
+            self.at = (0..self.rows).map(|_| self.windows[rng.random_range(0..self.windows.len())]).collect();
+        }
+        let shift = k as usize * FUTURE;
+        let shards: Vec<usize> = (0..self.rows).step_by(SHARD).collect();
+        shards.par_iter().map(|&first| self.shard(first, shift, &mut stream(seed, "latent noise", step << 16 | first as u64))).collect()
+    }
+
+    fn shard(&self, first: usize, shift: usize, rng: &mut Stream) -> Batch {
+        let rows = SHARD.min(self.rows - first);
+        let mut b = Batch {
+            rows,
+            seed: vec![0.0; rows * SEED_DIM],
+            target: vec![0.0; rows * (1 + FUTURE) * MARKER_DIM],
+            eps: normals(rng, rows * LATENT),
+        };
+        let mut window = vec![0.0; FRAMES * MARKER_DIM];
+        for row in 0..rows {
+            let (clip, start) = self.at[first + row];
+            self.set.canonical_window(clip, start + shift, FRAMES, &mut window);
+            let own = &self.seeds[(first + row) * SEED_DIM..(first + row + 1) * SEED_DIM];
+            let seed = if shift == 0 { &window[..SEED_DIM] } else { own };
+            for (t, frame) in seed.chunks_exact(MARKER_DIM).enumerate() {
+                put(&mut b.seed, rows, t, row, frame);
+            }
+            for (t, frame) in window[MARKER_DIM..].chunks_exact(MARKER_DIM).enumerate() {
+                put(&mut b.target, rows, t, row, frame);
+            }
+        }
+        b
+    }
+
+    /// Takes the last predicted frames of each shard (time-major, as `Tape::frames`) as the next seeds.
+    pub fn advance(&mut self, ends: &[&[f32]], body: &ShapedBody, regressor: &Regressor) -> Result<()> {
+        if self.depth == 1 {
+            return Ok(());
+        }
+        for (i, frames) in ends.iter().enumerate() {
+            let first = i * SHARD;
+            let rows = SHARD.min(self.rows - first);
+            let last = &frames[frames.len() - SEED * rows * MARKER_DIM..];
+            let seeds = &mut self.seeds[first * SEED_DIM..(first + rows) * SEED_DIM];
+            for (row, seed) in seeds.chunks_exact_mut(SEED_DIM).enumerate() {
+                for (t, frame) in seed.chunks_exact_mut(MARKER_DIM).enumerate() {
+                    frame.copy_from_slice(&last[(t * rows + row) * MARKER_DIM..][..MARKER_DIM]);
+                }
+            }
+        }
+        reseed(&mut self.seeds, body, regressor)
+    }
+}
+
+/// Turns the last frames of predictions (n x 2 x 201) into the next seeds exactly as the simulation does: half predicted markers,
+/// half those of the regressed body, in the canonical frame of the regressed body.
+pub fn reseed(seeds: &mut [f32], body: &ShapedBody, regressor: &Regressor) -> Result<()> {
+    let frames = seeds.len() / MARKER_DIM;
+    let betas = body.betas().repeat(frames);
+    let mut params = vec![0.0; frames * PARAMS];
+    regressor.regress(seeds, &betas, &mut params)?;
+    seeds.par_chunks_mut(SEED_DIM).zip(params.par_chunks(SEED * PARAMS)).for_each(|(seed, params)| {
+        let mut local = Frame::IDENTITY;
+        for (t, (frame, params)) in seed.chunks_exact_mut(MARKER_DIM).zip(params.chunks_exact(PARAMS)).enumerate() {
+            let posed = body.pose(params);
+            if t == 0 {
+                local = canonical_frame(posed.pos[joint::PELVIS], posed.pos[joint::L_HIP], posed.pos[joint::R_HIP]).inverse();
+            }
+            let mut skin = [0.0; MARKER_DIM];
+            body.markers(&posed, &mut skin);
+            for (a, b) in frame.chunks_exact_mut(3).zip(skin.chunks_exact(3)) {
+                let p = local.point(0.5 * (Vec3::from_slice(a) + Vec3::from_slice(b)));
+                a.copy_from_slice(&p.to_array());
+            }
+        }
+    });
+    Ok(())
+}
+
+/// Inputs of the regressor with what should come out.
+pub struct Bodies {
+    /// rows x 201.
+    pub markers: Vec<f32>,
+    /// rows x 10.
+    pub betas: Vec<f32>,
+    pub truth: Vec<Truth>,
+    /// Which of [`BodySource::shapes`] each is.
+    pub shape: Vec<usize>,
+}
+
+/// Draws bodies: recorded poses on several shapes with marker noise, and frames that the predictor made.
+pub struct BodySource<'a> {
+    set: &'a MotionSet,
+    /// The mean shape first.
+    pub shapes: Vec<ShapedBody>,
+    /// Frames of markers predicted from the prior, for the mean shape.
+    predicted: Vec<f32>,
+}
+
+/// Shapes to train on.
+const SHAPES: u64 = 64;
+/// Largest standard deviation of marker noise, metres.
+const NOISE: f32 = 0.015;
+
+impl<'a> BodySource<'a> {
+    pub fn new(set: &'a MotionSet, model: &BodyModel, seed: u64) -> Self {
+        let shape = |i| if i == 0 { vec![0.0; BETAS] } else { normals(&mut stream(seed, "shapes", i), BETAS) };
+        Self { set, shapes: (0..SHAPES).map(|i| model.shape(&shape(i))).collect(), predicted: Vec::new() }
+    }
+
+    /// Replaces the predicted frames by fresh ones of the prior.
+    pub fn predict(&mut self, decoder: &Decoder, rng: &mut Stream) -> Result<()> {
+        let windows = self.set.windows(SEED, 1);
+        let n = 2 * SHARD;
+        let mut seeds = vec![0.0; n * SEED_DIM];
+        for seed in seeds.chunks_exact_mut(SEED_DIM) {
+            let (clip, start) = windows[rng.random_range(0..windows.len())];
+            self.set.canonical_window(clip, start, SEED, seed);
+        }
+        self.predicted.resize(n * FUTURE * MARKER_DIM, 0.0);
+        decoder.decode(&seeds, &normals(rng, n * LATENT), &mut self.predicted)
+    }
+
+    /// `rows` bodies.
+    pub fn draw(&self, rows: usize, rng: &mut Stream) -> Bodies {
+        let mut b = Bodies { markers: Vec::new(), betas: Vec::new(), truth: Vec::new(), shape: Vec::new() };
+        let frames = self.predicted.len() / MARKER_DIM;
+        for _ in 0..rows {
+            if frames > 0 && rng.random_range(0..4) == 0 {
+                let at = rng.random_range(0..frames) * MARKER_DIM;
+                let markers = self.predicted[at..at + MARKER_DIM].to_vec();
+                b.markers.extend_from_slice(&markers);
+                b.truth.push(Truth { markers, pose: None });
+                b.shape.push(0);
+            } else {
+                let shape = if rng.random() { 0 } else { rng.random_range(0..self.shapes.len()) };
+                let truth = self.recorded(shape, rng);
+                let noise = (NOISE * rng.random_range(-0.5..1.0f32)).max(0.0);
+                b.markers.extend(truth.markers.iter().map(|v| v + noise * rng.sample::<f32, _>(StandardNormal)));
+                b.truth.push(truth);
+                b.shape.push(shape);
+            }
+            b.betas.extend_from_slice(self.shapes[b.shape[b.shape.len() - 1]].betas());
+        }
+        b
+    }
+
+    /// A recorded pose on shape `shape`, in the canonical frame of up to 19 frames earlier, feet on the floor.
+    pub fn recorded(&self, shape: usize, rng: &mut Stream) -> Truth {
+        let mean = &self.shapes[0];
+        let clip = {
+            // By length: a frame of all frames.
+            let mut at = rng.random_range(0..self.set.frames());
+            let mut clip = 0;
+            while at >= self.set.clips[clip].len() {
+                at -= self.set.clips[clip].len();
+                clip += 1;
+            }
+            clip
+        };
+        let t = rng.random_range(0..self.set.clips[clip].len());
+        let start = t.saturating_sub(rng.random_range(0..FRAMES));
+        let mut params = self.set.clips[clip].params[t * PARAMS..(t + 1) * PARAMS].to_vec();
+        mean.transform_params(&mut params, &self.set.frame(clip, start).inverse());
+        let body = &self.shapes[shape];
+        let mut markers = vec![0.0; MARKER_DIM];
+        mean.markers(&mean.pose(&params), &mut markers);
+        if shape != 0 {
+            let floor = lowest(&markers);
+            let shift = mean.joints()[joint::PELVIS] - body.joints()[joint::PELVIS];
+            params[0] += shift.x;
+            params[1] += shift.y;
+            body.markers(&body.pose(&params), &mut markers);
+            let lift = floor - lowest(&markers);
+            params[2] += lift;
+            markers.iter_mut().skip(2).step_by(3).for_each(|z| *z += lift);
+        }
+        Truth { markers, pose: Some((egogen::body::local_rotations(&params), Vec3::from_slice(&params[TRANSL]))) }
+    }
+}
+
+fn lowest(markers: &[f32]) -> f32 {
+    markers.iter().skip(2).step_by(3).fold(f32::INFINITY, |a, &b| a.min(b))
+}

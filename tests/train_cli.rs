@@ -1,5 +1,9 @@
 //! The program `train` as a person uses it.
 
+use egogen::body::{BETAS, BodyModel, MARKER_DIM, ORIENT, PARAMS, rotation};
+use egogen::motion::{CONTINUOUS, MotionConfig, MotionWeights, PredictorSizes, RegressorSizes};
+use egogen::sim::{SeedBank, SeedMotion};
+use egogen_train::primitives::init;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -180,4 +184,55 @@ fn an_interrupted_run_saves_and_continues() {
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     assert_eq!(start(&whole).wait().unwrap().code(), Some(0));
     assert_same_run(&whole, &cut, "epoch-0002");
+}
+
+/// A motion model that has learned nothing, and one upright seed.
+fn untrained_motion(dir: &Path) {
+    let body = BodyModel::embedded();
+    let shaped = body.shape(&[0.0; BETAS]);
+    let mut params = [0.0; PARAMS];
+    let up = glam::Mat3::from_rotation_z(std::f32::consts::PI) * glam::Mat3::from_rotation_x(std::f32::consts::FRAC_PI_2);
+    rotation::to_axis_angle(&up).write_to_slice(&mut params[ORIENT]);
+    params[2] = 0.95;
+    let mut markers = vec![0.0; MARKER_DIM];
+    shaped.markers(&shaped.pose(&params), &mut markers);
+    let predictor = PredictorSizes { hidden: 16, wide: 16, latent: 8, ..Default::default() };
+    let regressor = RegressorSizes { width: 16, blocks: 1, passes: 1 };
+    let config = MotionConfig { predictor, regressor, ..MotionConfig::new(body.hash()) };
+    let (p, r) = (init::predictor(predictor, 1, &markers), init::regressor(regressor, 1, &markers, &[0.0; CONTINUOUS]));
+    MotionWeights::save(dir, &config, &p, &r).unwrap();
+    let seed = SeedMotion { params: [params, params].concat(), betas: [0.0; BETAS] };
+    SeedBank { seeds: vec![seed] }.write(dir.join("seeds.safetensors"), &body).unwrap();
+}
+
+#[test]
+fn the_motion_task_trains_and_resumes() {
+    let dir = tempfile::tempdir().unwrap();
+    let motion = dir.path().join("motion");
+    untrained_motion(&motion);
+    let motion = format!("env_options.motion={}", motion.display());
+    let small = [
+        "run.envs=8",
+        "run.collect_steps=32",
+        "run.epoch_steps=64",
+        "ppo.batch=32",
+        "test.episodes=4",
+        "test.every=1",
+        "checkpoint.every=1",
+    ];
+    let sizes = ["policy.gru={ state = 16, egosensing = 8 }", "policy.trunk=16"];
+    let sets: Vec<&str> = small.iter().chain(&sizes).chain([&motion.as_str()]).flat_map(|s| ["--set", s]).collect();
+    let [whole, parts] = ["whole", "parts"].map(|n| dir.path().join(n));
+    let start = |out: &Path, epochs: &str| {
+        let output = train(&[&["quick", "--out", out.to_str().unwrap(), "--set", epochs], sets.as_slice()].concat());
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    };
+    start(&whole, "run.epochs=2");
+    start(&parts, "run.epochs=1");
+    let output = train(&["--resume", parts.to_str().unwrap(), "--set", "run.epochs=2"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    assert_same_run(&whole, &parts, "epoch-0002");
+    let bundle = egogen::agent::bundle::Bundle::read(&whole.join("policy")).unwrap();
+    bundle.require("body", BodyModel::embedded().hash()).unwrap();
+    assert!(bundle.require("motion", "another").unwrap_err().to_string().contains("motion another"));
 }

@@ -155,3 +155,56 @@ impl Bundle {
 fn floats<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().iter::<f32>().collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::agent::ObsGroup;
+
+    fn bundle() -> Bundle {
+        let group = |name: &str, shape: &[usize]| ObsGroup { name: name.into(), shape: shape.into() };
+        let layout = ObsLayout::new(vec![group("state", &[2, 5]), group("dist", &[1])]);
+        let config = serde_json::from_str(r#"{"gru": {"state": 6}, "octaves": 3}"#).unwrap();
+        let spec = PolicySpec::new(config, layout, 4).unwrap();
+        let params = spec.init(1);
+        let origin = BTreeMap::from([("motion".to_string(), "m1".to_string())]);
+        Bundle::new(spec, &params, origin, Trained::default()).unwrap()
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let dir = tempfile::tempdir().unwrap();
+        let written = bundle();
+        written.write(dir.path()).unwrap();
+        let read = Bundle::read(dir.path()).unwrap();
+        assert_eq!((&read.params, &read.spec, &read.origin), (&written.params, &written.spec, &written.origin));
+        read.require("motion", "m1").unwrap();
+        assert!(read.require("motion", "m2").unwrap_err().to_string().contains("trained on motion m1"));
+        assert!(read.require("body", "b").is_err());
+    }
+
+    #[test]
+    fn tampering_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let refused = |change: &dyn Fn(String) -> String, word: &str| {
+            bundle().write(dir.path()).unwrap();
+            let path = dir.path().join(DESCRIPTION);
+            let text = std::fs::read_to_string(&path).unwrap();
+            let changed = change(text.clone());
+            assert_ne!(text, changed);
+            std::fs::write(&path, changed).unwrap();
+            let error = Bundle::read(dir.path()).unwrap_err().to_string();
+            assert!(error.contains(word), "{error}");
+        };
+        refused(&|t| t.replacen("\"version\": 1", "\"version\": 2", 1), "layout version 2");
+        refused(&|t| t.replacen("\"format\": 1", "\"format\": 9", 1), "format is 9");
+        // Another clamp gives other outputs; the weights are the same.
+        refused(&|t| t.replacen("-2.5", "-0.01", 1).replacen("2.5\n", "0.01\n", 1), "golden.logvar");
+        bundle().write(dir.path()).unwrap();
+        let weights = dir.path().join(WEIGHTS);
+        let mut bytes = std::fs::read(&weights).unwrap();
+        *bytes.last_mut().unwrap() ^= 1;
+        std::fs::write(&weights, bytes).unwrap();
+        assert!(Bundle::read(dir.path()).unwrap_err().to_string().contains("content hash"));
+    }
+}

@@ -34,7 +34,7 @@ impl<'a> View<'a> {
         Self { data, stride }
     }
 
-    fn from_row(self, row: usize) -> &'a [f32] {
+    fn row(self, row: usize) -> &'a [f32] {
         &self.data[row * self.stride..]
     }
 }
@@ -146,10 +146,10 @@ impl Linear {
             for g in 0..groups {
                 let (start, end) = (g * rows / groups, (g + 1) * rows / groups);
                 let tile = &mut tile[..end - start];
-                simd::product(isa, x.from_row(start), x.stride, panel, tile);
+                simd::product(isa, x.row(start), x.stride, panel, tile);
                 if let Source::Plus(v) = source {
                     for (r, lane) in tile.iter_mut().enumerate() {
-                        let v = &v.from_row(start + r)[first..first + width];
+                        let v = &v.row(start + r)[first..first + width];
                         lane.0.iter_mut().zip(v).for_each(|(t, v)| *t += v);
                     }
                 }

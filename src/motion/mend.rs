@@ -33,8 +33,8 @@ pub fn mend_root(frames: &mut Vec<SourceFrame>) {
     for pair in sound.windows(2) {
         let (from, to) = (pair[0].end - 1, pair[1].start);
         let (a, b) = (frames[from].rots[0], frames[to].rots[0]);
-        for t in from + 1..to {
-            set_root(&mut frames[t], a.slerp(b, (t - from) as f32 / (to - from) as f32));
+        for (i, f) in frames[from..to].iter_mut().enumerate().skip(1) {
+            set_root(f, a.slerp(b, i as f32 / (to - from) as f32));
         }
     }
     frames.truncate(last);

@@ -1,7 +1,7 @@
 //! The program `train`.
 
 use crate::recipe::{EMBEDDED, Plan, Recipe, of_run};
-use crate::registry::Registry;
+use crate::registry::{Purpose, Registry};
 use crate::trainer::{Outcome, Trainer, policy_spec};
 use crate::{Error, Result};
 use clap::Parser;
@@ -140,7 +140,7 @@ fn run_folder(given: Option<&Path>, name: &str) -> Result<PathBuf> {
 
 fn describe(plan: &Plan, registry: &Registry) -> Result<u8> {
     let recipe = &plan.recipe;
-    let made = registry.make(&recipe.env, &recipe.env_options, 1)?;
+    let made = registry.make(&recipe.env, &recipe.env_options, 1, Purpose::Test)?;
     let spec = policy_spec(plan, made.env.spec())?;
     let per_epoch = plan.updates_per_epoch * recipe.run.collect_steps as u64;
     println!("{}", recipe.to_toml()?);

@@ -212,3 +212,70 @@ pub fn test_episodes(env: &mut dyn VecEnv, policy: &Policy, seed: u64, noise: bo
 
 /// Episodes longer than this do not count in tests.
 const MAX_TEST_STEPS: u64 = 10_000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::policy::Compute;
+    use egogen::agent::{ObsGroup, ObsLayout, PolicySpec};
+    use egogen_envs::point::PointGoal;
+
+    const ENVS: usize = 8;
+    const STEPS: usize = 45;
+
+    /// A stepped copy of the environments says what every value after a step must be a value of.
+    #[test]
+    fn values_after_steps_belong_to_the_right_observations() {
+        let group = |name: &str| ObsGroup { name: name.into(), shape: vec![2] };
+        let layout = ObsLayout::new(vec![group("position"), group("offset")]);
+        let spec = PolicySpec::new(serde_json::from_str("{}").unwrap(), layout, 2).unwrap();
+        let policy = Policy::new(&spec, &spec.init(5), &Compute::Own).unwrap();
+        let mut collector = Collector::new(Box::new(PointGoal::new(ENVS, 0)), 7).unwrap();
+        let rollout = collector.collect(&policy, STEPS).unwrap();
+        let mut copy = PointGoal::new(ENVS, 0);
+        let (mut obs, mut result) = (vec![], StepResult::default());
+        copy.reset(7, &mut obs).unwrap();
+        let (mut ended, mut cut) = (0, 0);
+        for t in 0..STEPS {
+            let rows = t * ENVS..(t + 1) * ENVS;
+            assert_eq!(rollout.obs[rows.start * 4..rows.end * 4], obs);
+            let acts = policy.act(&obs).unwrap();
+            assert_eq!(rollout.value[rows.clone()], acts.value);
+            copy.step(&rollout.actions[rows.start * 2..rows.end * 2], &mut result).unwrap();
+            let after = policy.values(&result.final_obs).unwrap();
+            for (i, k) in rows.enumerate() {
+                let want = if result.terminated[i] { 0.0 } else { after[i] };
+                assert_eq!(rollout.next_value[k], want, "step {t} of {i}");
+                let (mu, logvar) = (&acts.mu[2 * i..2 * i + 2], &acts.logvar[2 * i..2 * i + 2]);
+                assert_eq!(rollout.log_prob[k], log_prob_of(mu, logvar, &rollout.actions[2 * k..2 * k + 2]));
+                ended += usize::from(result.terminated[i]);
+                cut += usize::from(result.truncated[i]);
+            }
+            std::mem::swap(&mut obs, &mut result.obs);
+        }
+        assert!(ended > 0 && cut > 0, "{ended} terminations, {cut} truncations");
+        assert_eq!(rollout.episodes.len(), ended + cut);
+        // The environment counts returns and steps itself.
+        for e in &rollout.episodes {
+            assert!((e.total - e.figures[1]).abs() < 1e-5 && e.length as f32 == e.figures[2]);
+        }
+    }
+
+    #[test]
+    fn collecting_goes_on_from_a_saved_state() {
+        let spec_of = |env: &dyn VecEnv| {
+            let groups = env.spec().obs.iter().map(|g| ObsGroup { name: g.name.clone(), shape: g.shape.clone() }).collect();
+            PolicySpec::new(serde_json::from_str("{}").unwrap(), ObsLayout::new(groups), 2).unwrap()
+        };
+        let make = || Collector::new(Box::new(PointGoal::new(ENVS, 0)), 7).unwrap();
+        let mut a = make();
+        let spec = spec_of(a.env());
+        let policy = Policy::new(&spec, &spec.init(5), &Compute::Own).unwrap();
+        a.collect(&policy, 13).unwrap();
+        let mut b = make();
+        b.load(&a.save().unwrap()).unwrap();
+        let (x, y) = (a.collect(&policy, 9).unwrap(), b.collect(&policy, 9).unwrap());
+        assert_eq!((x.actions, x.reward, x.episodes), (y.actions, y.reward, y.episodes));
+        assert!(b.load(&[1, 2, 3]).is_err());
+    }
+}

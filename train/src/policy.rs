@@ -36,7 +36,7 @@ pub struct Policy {
 
 enum Acting {
     Own(Box<PolicyEngine>),
-    Burn(Network),
+    Burn(Box<Network>),
 }
 
 impl Policy {
@@ -44,7 +44,7 @@ impl Policy {
     pub fn new(spec: &PolicySpec, params: &[f32], compute: &Compute) -> Result<Self> {
         let acting = match compute {
             Compute::Own => Acting::Own(Box::new(PolicyEngine::new(spec, params)?)),
-            Compute::Burn(device) => Acting::Burn(Network::new(spec, params, device)),
+            Compute::Burn(device) => Acting::Burn(Box::new(Network::new(spec, params, device))),
         };
         Ok(Self { spec: spec.clone(), acting })
     }

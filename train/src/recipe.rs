@@ -156,9 +156,9 @@ impl Recipe {
             self.expect(key, value, value > 0, "at least 1")?;
         }
         self.expect("run.shards", run.shards, run.shards <= 64, "at most 64")?;
-        let whole = run.collect_steps % run.envs == 0;
+        let whole = run.collect_steps.is_multiple_of(run.envs);
         self.expect("run.collect_steps", run.collect_steps, whole, &format!("a multiple of run.envs = {}", run.envs))?;
-        let whole = run.collect_steps % self.ppo.batch == 0;
+        let whole = run.collect_steps.is_multiple_of(self.ppo.batch);
         self.expect("ppo.batch", self.ppo.batch, whole, &format!("a divisor of run.collect_steps = {}", run.collect_steps))?;
         let (ppo, adam) = (&self.ppo, &self.adam);
         for (key, value) in [("ppo.gamma", ppo.gamma), ("ppo.lambda", ppo.lambda)] {

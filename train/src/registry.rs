@@ -1,9 +1,17 @@
 //! Environments by name.
 
 use crate::{Error, Result};
+use egogen::body::BodyModel;
+use egogen::kernels::MotionEngine;
+use egogen::motion::MotionModel;
+use egogen::sim::{SeedBank, Sim};
 use egogen_envs::VecEnv;
+use egogen_envs::motion::{MotionEnv, MotionTask};
 use egogen_envs::point::PointGoal;
+use serde::Deserialize;
 use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
 
 /// A made environment and what it stands on.
 pub struct Made {
@@ -13,8 +21,17 @@ pub struct Made {
     pub origin: BTreeMap<String, String>,
 }
 
+/// What environments are made for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Purpose {
+    /// Learning: fresh starts.
+    Train,
+    /// Tests: the same starts after every reset with the same seed, whatever the policy does.
+    Test,
+}
+
 /// Makes that many environments from a recipe's `[env_options]`; refuses options it does not know.
-pub type Factory = Box<dyn Fn(&toml::Table, usize) -> Result<Made> + Send + Sync>;
+pub type Factory = Box<dyn Fn(&toml::Table, usize, Purpose) -> Result<Made> + Send + Sync>;
 
 /// The environments a program knows.
 #[derive(Default)]
@@ -26,7 +43,8 @@ impl Registry {
     /// The environments of this project.
     pub fn standard() -> Self {
         let mut registry = Self::default();
-        registry.add("point", |options, n| {
+        registry.add("motion", motion);
+        registry.add("point", |options, n, _| {
             if let Some(key) = options.keys().next() {
                 return Err(Error::config(format!("env_options.{key}: the environment 'point' has no options")));
             }
@@ -36,18 +54,56 @@ impl Registry {
     }
 
     /// Adds (or replaces) an environment.
-    pub fn add(&mut self, name: &str, factory: impl Fn(&toml::Table, usize) -> Result<Made> + Send + Sync + 'static) {
+    pub fn add(&mut self, name: &str, factory: impl Fn(&toml::Table, usize, Purpose) -> Result<Made> + Send + Sync + 'static) {
         self.factories.insert(name.into(), Box::new(factory));
     }
 
     /// Makes `n` environments of kind `name`.
-    pub fn make(&self, name: &str, options: &toml::Table, n: usize) -> Result<Made> {
+    pub fn make(&self, name: &str, options: &toml::Table, n: usize, purpose: Purpose) -> Result<Made> {
         match self.factories.get(name) {
-            Some(factory) => factory(options, n),
+            Some(factory) => factory(options, n, purpose),
             None => {
                 let known: Vec<_> = self.factories.keys().cloned().collect();
                 Err(Error::config(format!("env is '{name}', expected one of: {}", known.join(", "))))
             }
         }
     }
+}
+
+/// Options of the environment `motion`.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct MotionOptions {
+    /// Folder of the motion model.
+    #[serde(default = "shipped")]
+    motion: PathBuf,
+    /// Seed motions; without it, those beside the motion model.
+    #[serde(default)]
+    seeds: Option<PathBuf>,
+    /// The task.
+    #[serde(default)]
+    task: MotionTask,
+}
+
+fn shipped() -> PathBuf {
+    "checkpoints/motion".into()
+}
+
+/// People that walk to a goal round a box.
+fn motion(options: &toml::Table, n: usize, purpose: Purpose) -> Result<Made> {
+    let bad = |e: toml::de::Error| Error::config(format!("env_options: {}", e.to_string().trim_end()));
+    let options: MotionOptions = options.clone().try_into().map_err(bad)?;
+    options.task.validate().map_err(|e| Error::config(format!("env_options.task.{e}")))?;
+    let asset = |e: egogen::Error| Error::config(format!("env_options.motion: {e}"));
+    let body = BodyModel::embedded();
+    let model = MotionEngine::load(&options.motion).map_err(asset)?;
+    let seeds = options.seeds.unwrap_or_else(|| options.motion.join("seeds.safetensors"));
+    let bank = Arc::new(SeedBank::read(seeds, &body).map_err(asset)?);
+    let origin = [("motion", model.hash()), ("body", body.hash())].map(|(name, hash)| (name.to_string(), hash.to_string()));
+    let sim = Arc::new(Sim::new(body, Arc::new(model)));
+    let env = match purpose {
+        Purpose::Train => MotionEnv::new(options.task, sim, bank, n, 0),
+        Purpose::Test => MotionEnv::evaluation(options.task, sim, bank, n, 0),
+    };
+    Ok(Made { env: Box::new(env?), origin: origin.into() })
 }

@@ -6,7 +6,7 @@ use crate::logger::{Console, Csv, Logger, TensorBoard};
 use crate::policy::Compute;
 use crate::ppo::Learner;
 use crate::recipe::Plan;
-use crate::registry::Registry;
+use crate::registry::{Purpose, Registry};
 use crate::shards::Shards;
 use crate::stats::{Episodes, EpochStats, Row};
 use crate::{AdamW, Error, Result};
@@ -72,8 +72,8 @@ impl Trainer {
 
     fn build(plan: Plan, registry: &Registry, dir: &Path, threads: usize, from: Option<Checkpoint>) -> Result<Self> {
         let recipe = &plan.recipe;
-        let made = registry.make(&recipe.env, &recipe.env_options, recipe.run.envs)?;
-        let test_env = registry.make(&recipe.env, &recipe.env_options, recipe.test.episodes)?.env;
+        let made = registry.make(&recipe.env, &recipe.env_options, recipe.run.envs, Purpose::Train)?;
+        let test_env = registry.make(&recipe.env, &recipe.env_options, recipe.test.episodes, Purpose::Test)?.env;
         let env_spec = made.env.spec().clone();
         let spec = policy_spec(&plan, &env_spec)?;
         check_best(&recipe.checkpoint.best, &env_spec)?;
@@ -131,7 +131,7 @@ impl Trainer {
             let rate = steps as f64 / clock.total();
             let left = (epochs - self.epoch) as f64 * per_epoch as f64 * self.plan.recipe.run.collect_steps as f64 / rate;
             console.epoch(self.epoch, &row, rate, left);
-            if self.epoch % self.plan.recipe.checkpoint.every == 0 || self.epoch == epochs || stop.load(Ordering::SeqCst) {
+            if self.epoch.is_multiple_of(self.plan.recipe.checkpoint.every) || self.epoch == epochs || stop.load(Ordering::SeqCst) {
                 self.select(&row);
                 self.save()?;
             }
@@ -163,7 +163,7 @@ impl Trainer {
         let mut row: Row = vec![("updates".into(), Some(self.learner.updates() as f64)), ("env_steps".into(), Some(self.env_steps as f64))];
         row.extend(std::mem::take(&mut self.stats).row(&self.env_spec));
         let test = &self.plan.recipe.test;
-        let due = self.epoch % test.every == 0 || self.epoch == self.plan.recipe.run.epochs;
+        let due = self.epoch.is_multiple_of(test.every) || self.epoch == self.plan.recipe.run.epochs;
         let start = Instant::now();
         for (prefix, noise) in [("test_sto", true), ("test_det", false)] {
             let mut episodes = Episodes::default();

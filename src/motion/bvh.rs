@@ -1,6 +1,7 @@
 //! CMU motion in Biovision hierarchy (BVH) files.
 
-use super::cmu::{CMU_JOINTS, CMU_PARENTS, SourceClip, SourceFrame, UNIT, cmu_joint, leg_length};
+use super::cmu::{CMU_JOINTS, CMU_PARENTS, SourceClip, SourceFrame, cmu_joint, leg_length, rest_offset};
+use super::ik::arc;
 use crate::{Error, Result};
 use glam::{Quat, Vec3};
 use std::fs;
@@ -73,7 +74,8 @@ impl<'a> Words<'a> {
 
 /// Reads a BVH file of the CMU skeleton (38 joints, ends included, in the known order; names may differ).
 ///
-/// The rotations are put on the common CMU skeleton and the root's path is scaled by the ratio of the leg lengths.
+/// The rotations are put on the common CMU skeleton, limb by limb, so that every limb points where the file has it whatever
+/// its rest pose (some files rest with hanging arms); the root's path is scaled by the ratio of the leg lengths.
 pub fn read_bvh(path: impl AsRef<Path>, name: &str) -> Result<SourceClip> {
     let path = path.as_ref();
     let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
@@ -93,8 +95,10 @@ pub fn read_bvh(path: impl AsRef<Path>, name: &str) -> Result<SourceClip> {
         return Err(Error::file(path, format!("has {count} frames of {step} s, expected more than none of each")));
     }
     let leg = joints[cmu_joint::L_KNEE].offset.length() + joints[cmu_joint::L_ANKLE].offset.length();
+    // Metres per file unit, so that the legs get the common skeleton's length.
     let scale = leg_length() / leg;
-    let frames = (0..count).map(|_| parse_frame(&mut words, &joints, scale)).collect::<Result<_>>()?;
+    let align = alignments(&joints);
+    let frames = (0..count).map(|_| parse_frame(&mut words, &joints, scale, &align)).collect::<Result<_>>()?;
     if words.next < words.words.len() {
         return Err(words.error(&format!("the end of the file after {count} frames")));
     }
@@ -156,20 +160,33 @@ fn check_topology(path: &Path, joints: &[Joint]) -> Result<()> {
     }
 }
 
-fn parse_frame(words: &mut Words, joints: &[Joint], scale: f32) -> Result<SourceFrame> {
+/// Per joint the rest rotation that turns the common skeleton's limb into the file's; hands go with their forearms.
+fn alignments(joints: &[Joint]) -> [Quat; CMU_JOINTS] {
+    let mut align = [Quat::IDENTITY; CMU_JOINTS];
+    for (j, child) in [(2, 3), (3, 4), (8, 9), (9, 10), (21, 22), (22, 23), (30, 31), (31, 32)] {
+        align[j] = arc(rest_offset(child), joints[child].offset);
+    }
+    let (left, right) = (align[22], align[31]);
+    align[23..29].fill(left);
+    align[32..].fill(right);
+    align
+}
+
+fn parse_frame(words: &mut Words, joints: &[Joint], scale: f32, align: &[Quat; CMU_JOINTS]) -> Result<SourceFrame> {
     let mut frame = SourceFrame { root: Vec3::ZERO, rots: [Quat::IDENTITY; CMU_JOINTS] };
     for (j, joint) in joints.iter().enumerate() {
         let mut local = Quat::IDENTITY;
         for &channel in &joint.channels {
             let value = words.number()?;
             match channel {
-                Channel::Position(axis) if j == 0 => frame.root[axis] = value * UNIT * scale,
+                Channel::Position(axis) if j == 0 => frame.root[axis] = value * scale,
                 Channel::Position(_) => {}
                 Channel::Rotation(axis) => local *= Quat::from_axis_angle(Vec3::AXES[axis], value.to_radians()),
             }
         }
         frame.rots[j] = if j == 0 { local } else { (frame.rots[joint.parent] * local).normalize() };
     }
+    frame.rots.iter_mut().zip(align).for_each(|(rot, align)| *rot = (*rot * *align).normalize());
     Ok(frame)
 }
 

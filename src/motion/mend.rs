@@ -4,6 +4,7 @@
 //! The fault shows as a body that lies down in mid-air and then faces the mirror image of its way: on one side of the nonsense the
 //! pelvis looks 7 to 13 degrees past its way on average, on the other 46 to 111 (8 to 13 once inverted).
 
+use super::clip::{quantile, smoothstep};
 use super::cmu::SourceFrame;
 use glam::{Quat, Vec3};
 use std::ops::Range;
@@ -15,7 +16,12 @@ const MARGIN: usize = 12;
 /// Travel over that span from which on its direction counts, metres.
 const MOVING: f32 = 0.06;
 
+/// Sideways headings, as angles off the files' forward or backward axis: up to the first the pelvis' tilt is sound, from the
+/// second on it is not (people lean by up to 20 degrees more than elsewhere).
+const SIDEWAYS: [f32; 2] = [40.0 * std::f32::consts::PI / 180.0, 60.0 * std::f32::consts::PI / 180.0];
+
 /// Inverts the root's rotation where that makes the body face its way, and bridges the nonsense; cuts it off at the ends.
+/// Where the body then heads sideways, it takes the clip's usual tilt.
 ///
 /// Frames are at 120 per second, y up. A clip without a wild frame is left alone, whichever way it faces.
 pub fn mend_root(frames: &mut Vec<SourceFrame>) {
@@ -39,6 +45,29 @@ pub fn mend_root(frames: &mut Vec<SourceFrame>) {
     }
     frames.truncate(last);
     frames.drain(..first);
+    level_sideways(frames);
+}
+
+/// Gives the root the median pitch and roll of the other frames where it heads sideways; headings stay.
+fn level_sideways(frames: &mut [SourceFrame]) {
+    let parts: Vec<(f32, Vec3)> = frames
+        .iter()
+        .map(|f| {
+            let forward = f.rots[0] * Vec3::Z;
+            let yaw = forward.x.atan2(forward.z);
+            let tilt = (Quat::from_rotation_y(-yaw) * f.rots[0]).to_scaled_axis();
+            (yaw, tilt)
+        })
+        .collect();
+    let sideways = |yaw: f32| {
+        let off = yaw.abs().min(std::f32::consts::PI - yaw.abs());
+        smoothstep((off - SIDEWAYS[0]) / (SIDEWAYS[1] - SIDEWAYS[0]))
+    };
+    let sound = |axis: usize| parts.iter().filter(|(y, _)| sideways(*y) == 0.0).map(|(_, t)| t[axis]).collect::<Vec<_>>();
+    let usual = Vec3::new(quantile(&sound(0), 0.5), 0.0, quantile(&sound(2), 0.5));
+    for (f, (yaw, tilt)) in frames.iter_mut().zip(&parts) {
+        set_root(f, Quat::from_rotation_y(*yaw) * Quat::from_scaled_axis(tilt.lerp(usual, sideways(*yaw))));
+    }
 }
 
 /// Runs of frames that are more than the margin away from any wild one.

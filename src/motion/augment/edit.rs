@@ -11,6 +11,10 @@ const OTHER: [usize; BODY_JOINTS] = [0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 1
 const UPPER: [usize; 13] = [3, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21];
 /// Part of the limbs' swing that [`calm`] takes away at most.
 const CALM: f32 = 0.85;
+/// Steps shorter than this (metres) go by time, longer ones by way.
+const MIN_WAY: f32 = 0.2;
+/// Part of its length to which a standing leg is stretched.
+const STANDING: f32 = 0.99;
 
 /// The clip seen in a mirror: x -> -x with left and right swapped.
 pub fn mirror(clip: &Clip) -> Clip {
@@ -59,7 +63,7 @@ pub fn bent_path(clip: &Clip, yaw: &[f32], stride: &[f32]) -> Vec<Planar> {
 /// Moves the body along `path` (one transform per frame) while every stance of a foot moves as one rigid piece.
 ///
 /// A stance takes the transform of its middle frame, so the foot keeps its own roll and does not slide; in a swing the
-/// foot goes over from one stance's transform to the next by smoothstep. The legs follow by IK.
+/// foot goes over from one stance's transform to the next as it proceeds along its step. The legs follow by IK.
 pub fn replant(skeleton: &Skeleton, clip: &Clip, path: &[Planar]) -> Clip {
     let mut out = clip.clone();
     for (pose, m) in out.poses.iter_mut().zip(path) {
@@ -94,12 +98,27 @@ fn replanted_track(feet: &[FootPose], stances: &[std::ops::Range<usize>], path: 
                 return FootPose { ankle: b.point(feet[t].ankle), rot: b.rot(feet[t].rot), toe: b.rot(feet[t].toe) };
             }
             let (_, end, a) = plants[next - 1];
-            let s = smoothstep((t - end) as f32 / (start - end) as f32);
+            let s = progress(feet, end, start, t);
             let turned = Planar { yaw: a.yaw + s * (b.yaw - a.yaw), shift: Vec2::ZERO };
-            let ankle = a.point(feet[t].ankle).lerp(b.point(feet[t].ankle), s);
+            let (left, landed) = (feet[end].ankle, feet[start].ankle);
+            let (from, to) = (a.point(left), b.point(landed));
+            // From plant to plant on an arc that leaves and arrives along the turned headings, plus the clip's own
+            // deviation from its straight way.
+            let arc = (to - from).truncate().perp() * (-0.5 * s * (1.0 - s) * (b.yaw - a.yaw));
+            let ankle = from.lerp(to, s) + arc.extend(0.0) + turned.point(feet[t].ankle - left.lerp(landed, s));
             FootPose { ankle, rot: turned.rot(feet[t].rot), toe: turned.rot(feet[t].toe) }
         })
         .collect()
+}
+
+/// How much of the swing between frames `a` and `b` is done at `t`: the part of the step's way, or of its time when the
+/// foot lands near where it left.
+fn progress(feet: &[FootPose], a: usize, b: usize, t: usize) -> f32 {
+    let way = (feet[b].ankle - feet[a].ankle).with_z(0.0);
+    if way.length() < MIN_WAY {
+        return smoothstep((t - a) as f32 / (b - a) as f32);
+    }
+    ((feet[t].ankle - feet[a].ankle).dot(way) / way.length_squared()).clamp(0.0, 1.0)
 }
 
 /// The clip at the given frame times (fractional, within the clip; going backwards is allowed).
@@ -163,13 +182,11 @@ impl Spline {
     }
 }
 
-/// Takes the swing out of the body by `amount[t]` (0 none, 1 nearly all): upper limbs go to the clip's mean, feet become
-/// flat, the pelvis level and as high as in mid-stance. For slow, small steps and standing.
+/// Takes the swing out of the body by `amount[t]` (0 none, 1 nearly all): upper limbs go to the clip's mean and feet become
+/// flat. For slow, small steps and standing; see also [`raise`].
 pub fn calm(skeleton: &Skeleton, clip: &Clip, amount: &[f32]) -> Clip {
     let mut out = clip.clone();
     let mean = mean_locals(clip);
-    let heights: Vec<f32> = clip.poses.iter().map(|p| p.root.z).collect();
-    let high = crate::motion::clip::quantile(&heights, 0.8);
     for (t, pose) in out.poses.iter_mut().enumerate() {
         let a = CALM * amount[t];
         let old = clip.poses[t].rots;
@@ -181,15 +198,28 @@ pub fn calm(skeleton: &Skeleton, clip: &Clip, amount: &[f32]) -> Clip {
             let level = flat(heading(old[leg.ankle]));
             pose.rots[leg.ankle] = old[leg.ankle].slerp(level, a);
         }
-        pose.root.z += a * (high - pose.root.z);
     }
-    // Levelled about their ankles, the feet have left the floor and slipped: put them down again, without the new pelvis height.
-    let mut grounded = out.clone();
-    grounded.poses.iter_mut().zip(&clip.poses).for_each(|(p, old)| p.root = old.root);
-    lock_feet(skeleton, &mut grounded);
-    let feet = std::array::from_fn(|side| grounded.feet(skeleton, side));
+    // Levelled about their ankles, the feet have left the floor and slipped: put them down again.
+    lock_feet(skeleton, &mut out);
+    out
+}
+
+/// Brings the pelvis by `amount[t]` (0 to 1) to the height at which nearly straight legs carry it, feet unmoved.
+pub fn raise(skeleton: &Skeleton, clip: &Clip, amount: &[f32]) -> Clip {
+    let mut out = clip.clone();
+    let height = standing_height(skeleton);
+    for (pose, amount) in out.poses.iter_mut().zip(amount) {
+        pose.root.z += CALM * amount * (height - pose.root.z);
+    }
+    let feet = std::array::from_fn(|side| clip.feet(skeleton, side));
     set_feet(skeleton, &mut out, &feet);
     out
+}
+
+/// Height of the pelvis over flat feet with legs stretched to [`STANDING`] of their length, metres.
+fn standing_height(skeleton: &Skeleton) -> f32 {
+    let hips = 0.5 * (skeleton.rest[1].y + skeleton.rest[2].y) - skeleton.rest[0].y;
+    skeleton.ankle_height(0) + STANDING * skeleton.leg_length(0) - hips
 }
 
 /// Mean local rotation of each joint over the clip.

@@ -2,7 +2,7 @@
 
 mod edit;
 
-pub use edit::{Planar, bent_path, calm, mirror, replant, resample};
+pub use edit::{Planar, bent_path, calm, mirror, raise, replant, resample};
 
 use super::FPS;
 use super::clip::{Clip, SIDES, Skeleton, heading, quantile, smoothstep, wrap};
@@ -10,8 +10,8 @@ use super::footlock::slides;
 use crate::rng::{Stream, stream};
 use rand::RngExt;
 
-/// Fastest yaw rate that bending adds, radians per second (95 degrees).
-const MAX_RATE: f32 = 1.66;
+/// Fastest yaw rate that bending adds, radians per second (110 degrees, as real turns have it).
+const MAX_RATE: f32 = 1.92;
 /// An augmented clip is kept when its 90 % slide (metres) and its 98 % hip twist (radians) stay below these.
 const MAX_SLIDE: f32 = 0.015;
 const MAX_TWIST: f32 = 1.05;
@@ -90,7 +90,11 @@ fn bend(skeleton: &Skeleton, clip: &Clip, strength: f32, rng: &mut Stream) -> Cl
 /// Yaw angle per frame: the integral of a rate that moves smoothly between random values, one each 0.8 to 1.6 s.
 fn random_yaw(len: usize, strength: f32, rng: &mut Stream) -> Vec<f32> {
     let limit = strength * MAX_RATE;
-    let draw = |rng: &mut Stream| limit * rng.random_range(-1.0f32..1.0);
+    // The square root favours strong turns: smoothing between draws weakens them.
+    let draw = |rng: &mut Stream| {
+        let u = rng.random_range(-1.0f32..1.0);
+        limit * u.signum() * u.abs().sqrt()
+    };
     let (mut from, mut to) = (draw(rng), draw(rng));
     let (mut start, mut span) = (0.0, rng.random_range(0.8..1.6) * FPS);
     let mut angle = 0.0;
@@ -122,7 +126,7 @@ fn stop(skeleton: &Skeleton, clip: &Clip, rng: &mut Stream) -> Option<Clip> {
     let quiet: Vec<f32> = fade.iter().map(|f| (1.0 - least) * f).collect();
     let calmed = calm(skeleton, clip, &quiet);
     let yaw = random_yaw(n, 0.7, rng);
-    let bent = replant(skeleton, &calmed, &bent_path(&calmed, &yaw, &stride));
+    let bent = raise(skeleton, &replant(skeleton, &calmed, &bent_path(&calmed, &yaw, &stride)), &quiet);
     let hold = rng.random_range(0.3..1.5f32);
     Some(resample(skeleton, &bent, &stop_times(n, at, rng.random_range(0.3..0.6f32), hold)))
 }
@@ -160,7 +164,7 @@ fn small_steps(skeleton: &Skeleton, clip: &Clip, rng: &mut Stream) -> Clip {
     let quiet: Vec<f32> = stride.iter().map(|s| 0.8 * (1.0 - s.abs())).collect();
     let calmed = calm(skeleton, clip, &quiet);
     let yaw = random_yaw(n, 1.1, rng);
-    let bent = replant(skeleton, &calmed, &bent_path(&calmed, &yaw, &stride));
+    let bent = raise(skeleton, &replant(skeleton, &calmed, &bent_path(&calmed, &yaw, &stride)), &quiet);
     resample(skeleton, &bent, &uniform_times(n, rng.random_range(0.7..1.0)))
 }
 

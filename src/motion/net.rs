@@ -94,3 +94,45 @@ impl GruNet {
         add_grad(&self.bias_hh, grads, &mut out.bias_hh);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::io::Tensors;
+    use crate::motion::{Predictor, PredictorSizes, PredictorWeights, Regressor, RegressorSizes, RegressorWeights};
+
+    /// Weights in the authors' layout, inputs and outputs, made by torch at reduced width.
+    fn fixture() -> Tensors {
+        Tensors::read(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/motion_model.safetensors")).unwrap()
+    }
+
+    fn input<const D: usize>(t: &Tensors, name: &str) -> Tensor<D> {
+        let shape: [usize; D] = t.shape(name).unwrap().try_into().unwrap();
+        Tensor::from_data(TensorData::new(t.f32s(name, &shape).unwrap(), shape), &Device::flex())
+    }
+
+    fn close<const D: usize>(have: Tensor<D>, t: &Tensors, name: &str) {
+        let want: Tensor<D> = input(t, name);
+        assert_eq!(have.dims(), want.dims());
+        let worst = (have - want).abs().max().into_scalar::<f32>();
+        assert!(worst < 1e-5, "{name} is off by {worst}");
+    }
+
+    #[test]
+    fn predictor_matches_torch() {
+        let t = fixture();
+        let w = PredictorWeights::read(&t, PredictorSizes { frame: 9, hidden: 8, wide: 12, latent: 5 }).unwrap();
+        let net = Predictor::new(&w, &Device::flex());
+        let (mu, logvar) = net.encode(input(&t, "seed"), input(&t, "future"));
+        close(mu, &t, "mu");
+        close(logvar, &t, "logvar");
+        close(net.decode(input(&t, "seed"), input(&t, "latent"), 6), &t, "decoded");
+    }
+
+    #[test]
+    fn regressor_matches_torch() {
+        let t = fixture();
+        let w = RegressorWeights::read(&t, RegressorSizes { width: 6, blocks: 2, passes: 3 }).unwrap();
+        close(Regressor::new(&w, &Device::flex()).forward(input(&t, "markers"), input(&t, "betas")), &t, "body");
+    }
+}

@@ -188,6 +188,8 @@ impl<'a> Run<'a> {
     fn fit_predictor(&mut self, depth: usize, stop: &AtomicBool, mut progress: Progress) -> Result<Outcome> {
         let s = self.place.settings.clone();
         let rows = s.batch[self.place.stage];
+        // Early samples of the prior have no feet to speak of.
+        let loss_weights = LossWeights { contact: if depth > 1 { s.loss.contact } else { 0.0 }, ..s.loss };
         let mut lanes = Lanes::new(self.set, rows, depth)?;
         let regressor = Regressor::new(&self.regressor.weights)?;
         let mut shards: Vec<(predictor::Tape, PredictorWeights)> =
@@ -205,7 +207,7 @@ impl<'a> Run<'a> {
             let parts: Vec<LossParts> = shards
                 .par_iter_mut()
                 .zip(&batch)
-                .map(|((tape, grad), b)| loss::step(weights, grad, tape, b, &s.loss, b.rows as f32 / rows as f32))
+                .map(|((tape, grad), b)| loss::step(weights, grad, tape, b, &loss_weights, b.rows as f32 / rows as f32))
                 .collect();
             let (first, rest) = shards.split_at_mut(1);
             rest.iter_mut().for_each(|(_, g)| merge(&mut first[0].1, g));
@@ -215,7 +217,7 @@ impl<'a> Run<'a> {
             self.place.step += 1;
             let share = 1.0 / parts.len() as f32;
             let mean = |f: fn(&LossParts) -> f32| parts.iter().map(f).sum::<f32>() * share;
-            let figures = [mean(|p| p.reconstruction), mean(|p| p.velocity), mean(|p| p.kl), mean(|p| p.skate)];
+            let figures = [mean(|p| p.reconstruction), mean(|p| p.velocity), mean(|p| p.kl), mean(|p| p.skate), mean(|p| p.contact)];
             progress.step(self.place.step, fraction, rate, &figures)?;
         }
     }

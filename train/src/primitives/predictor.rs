@@ -28,6 +28,11 @@ impl<'a> Ready<'a> {
         let (d_rnn, (first, second)) = join(|| Packed::hidden(cell), || join(|| Packed::dense(&w.d_mlp[0]), || Packed::dense(&w.d_mlp[1])));
         Ok(Self { w, x_enc: x_enc?, e_rnn: e_rnn?, d_rnn: d_rnn?, frame: frame?, d_mlp: [first?, second?], d_out: d_out? })
     }
+
+    /// Width of the states.
+    pub fn hidden(&self) -> usize {
+        self.w.d_rnn.hidden
+    }
 }
 
 /// Everything one forward pass leaves behind; reused from batch to batch. Time outermost, then people.
@@ -122,7 +127,7 @@ impl Tape {
     }
 
     /// Adds all weight gradients. `d_frames` (steps x rows x frame) is the loss's gradient with respect to the predicted
-    /// frames, used up; `d_mu`, `d_logvar` its direct gradients with respect to those; `eps` the noise that made the latent.
+    /// frames, used up; `d_mu`, `d_logvar` its direct gradients with respect to those; `eps` the noise that made the latent. `d_hx` (rows x hidden): gradients of the seed's state from elsewhere.
     pub fn backward(
         &mut self,
         p: &Ready,
@@ -131,10 +136,10 @@ impl Tape {
         d_frames: &mut [f32],
         d_mu: &mut [f32],
         d_logvar: &mut [f32],
+        mut d_hx: Vec<f32>,
     ) {
         let w = p.w;
         let (h, rows, latent) = (w.d_rnn.hidden, batch.rows, w.e_mu.output);
-        let mut d_hx = vec![0.0; rows * h];
         let d_constant = self.decoder_back(p, g, d_frames, rows, &mut d_hx);
         for (i, row) in d_constant.chunks_exact(h + latent).enumerate() {
             add_rows(&row[..h], &mut d_hx[i * h..(i + 1) * h]);
@@ -145,6 +150,17 @@ impl Tape {
             }
         }
         self.encoder_back(p, g, batch, d_mu, d_logvar, d_hx);
+    }
+
+    /// Backward through a decoding whose latent came from outside; returns the gradient of the seed's state.
+    pub fn backward_prior(&mut self, p: &Ready, g: &mut PredictorWeights, d_frames: &mut [f32], rows: usize) -> Vec<f32> {
+        let h = p.w.d_rnn.hidden;
+        let mut d_hx = vec![0.0; rows * h];
+        let d_constant = self.decoder_back(p, g, d_frames, rows, &mut d_hx);
+        for (d, row) in d_hx.chunks_exact_mut(h).zip(d_constant.chunks_exact(h + p.w.e_mu.output)) {
+            add_rows(&row[..h], d);
+        }
+        d_hx
     }
 
     /// Backward through the decoder; returns the gradient of its constant input and adds to that of the seed's state.

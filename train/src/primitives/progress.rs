@@ -32,7 +32,7 @@ impl Progress {
     pub fn new(out: &Path, stage: Stage, step: u64) -> Result<Self> {
         let names: &[&str] = match stage {
             Stage::Body => &["loss", "marker_distance"],
-            _ => &["reconstruction", "velocity", "kl", "skate"],
+            _ => &["reconstruction", "velocity", "kl", "skate", "contact"],
         };
         let path = out.join(format!("{}.csv", format!("{stage:?}").to_lowercase()));
         std::fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;

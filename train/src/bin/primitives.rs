@@ -88,6 +88,12 @@ struct Train {
     /// Weight of the loss against sliding feet.
     #[arg(long)]
     skate: Option<f32>,
+    /// Weight of the loss against sliding of the prior's samples.
+    #[arg(long)]
+    contact: Option<f32>,
+    /// Start with the networks of this motion-model folder.
+    #[arg(long, value_name = "DIR", conflicts_with = "resume")]
+    start_from: Option<PathBuf>,
     /// Go on from the state in --out, with its settings.
     #[arg(long)]
     resume: bool,
@@ -136,7 +142,12 @@ fn train(args: Train) -> Result<ExitCode> {
         let mut settings = Settings { seed: args.seed, minutes: args.minutes, ..Default::default() };
         settings.loss.kl = args.kl.unwrap_or(settings.loss.kl);
         settings.loss.skate = args.skate.unwrap_or(settings.loss.skate);
-        Run::new(&set, &body, settings, &args.out)
+        settings.loss.contact = args.contact.unwrap_or(settings.loss.contact);
+        let fresh = Run::new(&set, &body, settings, &args.out);
+        match &args.start_from {
+            Some(dir) => fresh.start_from(dir)?,
+            None => fresh,
+        }
     };
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();

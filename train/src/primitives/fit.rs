@@ -131,6 +131,17 @@ impl<'a> Run<'a> {
         }
     }
 
+    /// Takes the networks of the motion-model folder `dir` instead of fresh ones, to train them further on other data or losses.
+    pub fn start_from(mut self, dir: &Path) -> Result<Self> {
+        let w = MotionWeights::load(dir)?;
+        let c = MotionConfig::new(self.model.hash());
+        if w.config != c {
+            return Err(Error::file(dir, format!("holds a model of {:?}, expected {c:?}", w.config)));
+        }
+        (self.predictor.weights, self.regressor.weights) = (w.predictor, w.regressor);
+        Ok(self)
+    }
+
     /// Goes on where the checkpoint in `out` left off, with its settings.
     pub fn resume(set: &'a MotionSet, model: &'a BodyModel, out: impl Into<PathBuf>) -> Result<Self> {
         let out = out.into();

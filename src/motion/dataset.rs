@@ -216,3 +216,24 @@ impl fmt::Display for BuildReport {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The unpacked archive, from EGOGEN_MOCAP; the data is not part of the repository.
+    #[test]
+    fn recorded_walks_keep_their_quality() {
+        let Ok(dir) = std::env::var("EGOGEN_MOCAP") else {
+            println!("skipped: set EGOGEN_MOCAP to the folder of the unpacked mocap-cmu archive");
+            return;
+        };
+        let model = BodyModel::load(Path::new(env!("CARGO_MANIFEST_DIR")).join("checkpoints/body/body.safetensors")).unwrap();
+        let (train, held_out, report) = build(dir, 0, &model).unwrap();
+        println!("{report}");
+        let all = &report.sets.iter().find(|(name, _)| name == "training").unwrap().1;
+        assert!(all.seconds > 3000.0 && held_out.clips.len() == 8 && train.clips.len() == all.clips);
+        assert!(all.slide[1] < 0.015 && report.slide_before[1] > 0.02);
+        assert!(all.yaw[0] < -40.0 && all.yaw[4] > 40.0 && all.speed[1] < 0.0 && all.speed[3] > 1.2);
+    }
+}

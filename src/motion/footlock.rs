@@ -112,8 +112,8 @@ fn bend_toes(skeleton: &Skeleton, side: usize, feet: &mut [FootPose], stances: &
             bend[t] = pitch(&feet[t]).clamp(0.0, TOE_BEND);
         }
         let last = bend[stance.end - 1];
-        for t in stance.end..feet.len().min(stance.end + TOE_RELAX as usize) {
-            bend[t] = last * (1.0 - smoothstep((t + 1 - stance.end) as f32 / TOE_RELAX));
+        for (i, bend) in bend[stance.end..].iter_mut().take(TOE_RELAX as usize).enumerate() {
+            *bend = last * (1.0 - smoothstep((i + 1) as f32 / TOE_RELAX));
         }
     }
     for (foot, bend) in feet.iter_mut().zip(bend) {
@@ -157,9 +157,9 @@ fn fill_swings(fix: &mut [Correction], stances: &[Range<usize>]) {
     for pair in stances.windows(2) {
         let (a, b) = (fix[pair[0].end - 1], fix[pair[1].start]);
         let span = (pair[1].start + 1 - pair[0].end) as f32;
-        for t in pair[0].end..pair[1].start {
-            let s = smoothstep((t + 1 - pair[0].end) as f32 / span);
-            fix[t] = Correction { yaw: a.yaw + s * wrap(b.yaw - a.yaw), shift: a.shift.lerp(b.shift, s) };
+        for (i, fix) in fix[pair[0].end..pair[1].start].iter_mut().enumerate() {
+            let s = smoothstep((i + 1) as f32 / span);
+            *fix = Correction { yaw: a.yaw + s * wrap(b.yaw - a.yaw), shift: a.shift.lerp(b.shift, s) };
         }
     }
 }

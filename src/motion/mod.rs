@@ -2,6 +2,7 @@
 
 pub mod augment;
 pub mod bvh;
+pub mod clean;
 pub mod clip;
 pub mod cmu;
 pub mod dataset;

@@ -1,6 +1,7 @@
 //! From the CMU skeleton to the project's body.
 
 use super::FPS;
+use super::clean::{clean, smooth};
 use super::clip::{Clip, Pose, SIDES, Skeleton, heading, quantile, speeds, upright};
 use super::cmu::{SourceClip, SourceFrame, cmu_joint, leg_length, rest_offset};
 use super::footlock::{detect_contact, flat, lock_feet, slides};
@@ -39,12 +40,14 @@ pub fn retarget(skeleton: &Skeleton, source: &SourceClip) -> Result<(Clip, Retar
     if step == 0 || (source.fps - FPS * step as f32).abs() > 1.0 {
         return Err(Error::invalid(format!("clip {}: {} frames per second, expected a multiple of {FPS}", source.name, source.fps)));
     }
-    let frames: Vec<&SourceFrame> = source.frames.iter().step_by(step).collect();
+    let cleaned = clean(&source.frames);
+    let frames: Vec<&SourceFrame> = cleaned.iter().step_by(step).collect();
     let align = alignments(skeleton);
     let scale = skeleton.leg_length(0) / leg_length();
     let poses = frames.iter().map(|f| map_frame(skeleton, f, &align, scale)).collect();
     let mut clip = Clip { name: source.name.clone(), poses, contact: vec![[false; SIDES]; frames.len()] };
     let mut report = RetargetReport { joint_error: joint_error(skeleton, &clip, &frames, scale), ..Default::default() };
+    clip.poses = smooth(&clip.poses);
     level_posture(skeleton, &mut clip);
     level_feet(skeleton, &mut clip);
     report.ground_shift = put_on_floor(skeleton, &mut clip);

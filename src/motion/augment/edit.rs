@@ -137,7 +137,8 @@ pub fn resample(skeleton: &Skeleton, clip: &Clip, times: &[f32]) -> Clip {
             root: spline.point(|t| clip.poses[t].root),
             rots: std::array::from_fn(|j| spline.rot(|t| clip.poses[t].rots[j])),
         });
-        out.contact.push(clip.contact[time.round() as usize]);
+        let (a, b) = (clip.contact[time as usize], clip.contact[time.ceil() as usize]);
+        out.contact.push([a[0] && b[0], a[1] && b[1]]);
         for (track, feet) in tracks.iter_mut().zip(&feet) {
             track.push(FootPose {
                 ankle: spline.point(|t| feet[t].ankle),

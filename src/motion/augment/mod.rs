@@ -1,6 +1,8 @@
 //! Augmentation: turning, slowing, stopping, small and backward steps, made from straight walks.
 
 mod edit;
+#[cfg(test)]
+mod tests;
 
 pub use edit::{Planar, bent_path, calm, mirror, raise, replant, resample};
 
@@ -12,9 +14,11 @@ use rand::RngExt;
 
 /// Fastest yaw rate that bending adds, radians per second (110 degrees, as real turns have it).
 const MAX_RATE: f32 = 1.92;
-/// An augmented clip is kept when its 90 % slide (metres) and its 98 % hip twist (radians) stay below these.
+/// An augmented clip is kept when its 90 % slide (metres), its 98 % hip twist (radians) and the greatest acceleration of a
+/// joint (m/s^2, recorded walks have up to 105) stay below these.
 const MAX_SLIDE: f32 = 0.015;
 const MAX_TWIST: f32 = 1.05;
+const MAX_ACCELERATION: f32 = 130.0;
 /// Frames an augmented clip must have.
 const MIN_FRAMES: usize = 40;
 
@@ -182,4 +186,12 @@ fn keep(skeleton: &Skeleton, clip: &Clip) -> bool {
     clip.len() >= MIN_FRAMES
         && quantile(&slides(skeleton, clip), 0.9) < MAX_SLIDE
         && quantile(&hip_twists(skeleton, clip), 0.98) < MAX_TWIST
+        && greatest_acceleration(skeleton, clip) < MAX_ACCELERATION
+}
+
+/// Greatest acceleration of any joint, metres per second squared.
+pub fn greatest_acceleration(skeleton: &Skeleton, clip: &Clip) -> f32 {
+    let joints: Vec<_> = clip.poses.iter().map(|p| skeleton.joints(p)).collect();
+    let bends = joints.windows(3).flat_map(|w| (0..w[0].len()).map(move |j| (w[2][j] - 2.0 * w[1][j] + w[0][j]).length()));
+    bends.fold(0.0, f32::max) * FPS * FPS
 }

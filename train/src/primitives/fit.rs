@@ -62,7 +62,7 @@ impl Default for Settings {
             seed: 0,
             steps: [6000, 8000, 5000],
             minutes: None,
-            shares: [0.45, 0.2, 0.35],
+            shares: [0.4, 0.15, 0.45],
             batch: [64, 256, 64],
             rates: [[1e-3, 3e-4], [1e-3, 2e-5], [5e-4, 1e-5]],
             depth: 4,

@@ -2,12 +2,13 @@
 
 use super::predictor::{Ready, Tape};
 use super::sample::normals;
+use super::seeds::make_seeds;
 use egogen::body::{BETAS, BodyModel, MARKER_DIM, PARAMS, ShapedBody, joint};
 use egogen::kernels::{MotionEngine, Regressor};
 use egogen::metrics::{contact_score, foot_heights, kl_to_standard, rigid_marker_error, stance_slide};
 use egogen::motion::{FPS, FRAMES, FUTURE, LATENT, MotionSet, MotionWeights, SEED};
 use egogen::rng::stream;
-use egogen::sim::{People, Primitives, SeedMotion, Sim};
+use egogen::sim::{People, Primitives, SeedBank, SeedMotion, Sim};
 use egogen::{Error, Result};
 use glam::Vec3;
 use rand::RngExt;
@@ -114,7 +115,7 @@ pub fn evaluate(weights: &MotionWeights, body: &Arc<BodyModel>, train: &MotionSe
         data: data_gait(train)?,
         prior,
         drift,
-        greedy: greedy(&sim, train, effort.episodes)?,
+        greedy: greedy(&sim, &make_seeds(&sim, train)?, effort.episodes)?,
     })
 }
 
@@ -123,8 +124,8 @@ fn seed_motion(set: &MotionSet, clip: usize, start: usize) -> SeedMotion {
     SeedMotion { params: set.clips[clip].params[start * PARAMS..(start + SEED) * PARAMS].to_vec(), betas: [0.0; BETAS] }
 }
 
-/// `n` people at the origin who start as recorded somewhere in `set`, facing `yaw(i)`.
-pub fn start_people(sim: &Sim, set: &MotionSet, n: usize, purpose: &str, yaw: impl Fn(usize) -> f32) -> Result<People> {
+/// `n` people at the origin who start as recorded somewhere in `set`.
+pub fn start_people(sim: &Sim, set: &MotionSet, n: usize, purpose: &str) -> Result<People> {
     let windows = set.windows(SEED, 1);
     if windows.is_empty() {
         return Err(Error::invalid("the motion set is empty"));
@@ -132,7 +133,7 @@ pub fn start_people(sim: &Sim, set: &MotionSet, n: usize, purpose: &str, yaw: im
     let mut people = People::new(n);
     for i in 0..n {
         let (clip, start) = windows[stream(0, purpose, i as u64).random_range(0..windows.len())];
-        people.place(i, sim.body(), &seed_motion(set, clip, start), yaw(i), 0.0, 0.0)?;
+        people.place(i, sim.body(), &seed_motion(set, clip, start), 0.0, 0.0, 0.0)?;
     }
     Ok(people)
 }
@@ -242,7 +243,7 @@ fn data_gait(set: &MotionSet) -> Result<Gait> {
 }
 
 fn roll_out(sim: &Sim, body: &ShapedBody, set: &MotionSet, n: usize) -> Result<(Gait, Vec<Drift>)> {
-    let mut people = start_people(sim, set, n, "roll-out starts", |_| 0.0)?;
+    let mut people = start_people(sim, set, n, "roll-out starts")?;
     let mut out = Primitives::default();
     let (mut sums, mut drift) = (GaitSums::default(), Vec::new());
     for k in 1..=ROLLOUT {
@@ -302,10 +303,13 @@ const TOGETHER: usize = 20;
 
 /// Goals 2 to 3 m away in a direction within 36 degrees of where the person faces; at each step the best of 64 prior latents by
 /// distance and heading.
-fn greedy(sim: &Sim, set: &MotionSet, episodes: usize) -> Result<Greedy> {
+fn greedy(sim: &Sim, bank: &SeedBank, episodes: usize) -> Result<Greedy> {
+    if bank.seeds.is_empty() {
+        return Err(Error::invalid("the model's own motion gives no seed that stands on the floor"));
+    }
     let mut ends: Vec<(Option<usize>, f32)> = Vec::new();
     for first in (0..episodes).step_by(TOGETHER) {
-        ends.extend(walk(sim, set, first, TOGETHER.min(episodes - first))?);
+        ends.extend(walk(sim, bank, first, TOGETHER.min(episodes - first))?);
     }
     let steps: Vec<f32> = ends.iter().filter_map(|e| e.0).map(|s| s as f32).collect();
     let missed: Vec<f32> = ends.iter().filter(|e| e.0.is_none()).map(|e| e.1).collect();
@@ -319,9 +323,14 @@ fn greedy(sim: &Sim, set: &MotionSet, episodes: usize) -> Result<Greedy> {
 }
 
 /// Episodes `first..first + n`: the step of arrival, and the distance at the end.
-fn walk(sim: &Sim, set: &MotionSet, first: usize, n: usize) -> Result<Vec<(Option<usize>, f32)>> {
-    let all = start_people(sim, set, first + n, "greedy starts", |_| 0.0)?;
-    let mut people: Vec<People> = (first..first + n).map(|i| pick(&all, &[i])).collect();
+fn walk(sim: &Sim, bank: &SeedBank, first: usize, n: usize) -> Result<Vec<(Option<usize>, f32)>> {
+    let mut people = Vec::with_capacity(n);
+    for i in first..first + n {
+        // From the half that is kept for evaluation.
+        let (half, mut one) = (bank.seeds.len() / 2, People::new(1));
+        one.place(0, sim.body(), &bank.seeds[half + i % (bank.seeds.len() - half)], 0.0, 0.0, 0.0)?;
+        people.push(one);
+    }
     let goals: Vec<Vec3> = (first..first + n)
         .map(|i| {
             let rng = &mut stream(0, "greedy goals", i as u64);

@@ -6,7 +6,7 @@ use super::progress::Progress;
 use super::sample::{BodySource, Lanes, SHARD};
 use super::{init, predictor, regressor};
 use egogen::body::rotation::to_6d;
-use egogen::body::{BODY_JOINTS, BodyModel, MARKER_DIM, ShapedBody};
+use egogen::body::{BodyModel, MARKER_DIM, ShapedBody};
 use egogen::io::{Precision, Tensors, pack_tensors, write_atomic};
 use egogen::kernels::{Decoder, Regressor};
 use egogen::motion::{
@@ -208,10 +208,10 @@ impl<'a> Run<'a> {
         let mut clock = Clock::new(self.place.spent);
         loop {
             let fraction = self.fraction(clock.spent());
-            if lanes.is_start(self.place.step) {
-                if let Some(outcome) = self.pause(&mut clock, fraction, stop)? {
-                    return Ok(outcome);
-                }
+            if lanes.is_start(self.place.step)
+                && let Some(outcome) = self.pause(&mut clock, fraction, stop)?
+            {
+                return Ok(outcome);
             }
             let batch = lanes.batch(s.seed ^ self.place.stage as u64, self.place.step);
             let weights = &predictor::Ready::new(&self.predictor.weights)?;
@@ -341,8 +341,8 @@ fn means(source: &BodySource, seed: u64) -> (Vec<f32>, [f32; CONTINUOUS]) {
         markers.iter_mut().zip(&truth.markers).for_each(|(m, v)| *m += v / n as f32);
         let Some((local, transl)) = truth.pose else { continue };
         body.iter_mut().zip(transl.to_array()).for_each(|(b, v)| *b += v / n as f32);
-        for k in 0..BODY_JOINTS {
-            body[3 + 6 * k..9 + 6 * k].iter_mut().zip(to_6d(&local[k])).for_each(|(b, v)| *b += v / n as f32);
+        for (six, rot) in body[3..].chunks_exact_mut(6).zip(&local) {
+            six.iter_mut().zip(to_6d(rot)).for_each(|(b, v)| *b += v / n as f32);
         }
     }
     (markers, body)

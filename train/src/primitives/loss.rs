@@ -84,7 +84,7 @@ pub fn step(w: &Ready, grad: &mut PredictorWeights, tape: &mut Tape, batch: &Bat
     let slope = share * weights.kl * kl_term(parts.kl, weights.robust).1 / tape.mu.len() as f32;
     let mut d_mu: Vec<f32> = tape.mu.iter().map(|m| slope * m).collect();
     let mut d_logvar: Vec<f32> = tape.logvar.iter().map(|v| 0.5 * slope * (v.exp() - 1.0)).collect();
-    tape.backward(w, grad, batch, &mut d_frames, &mut d_mu, &mut d_logvar, d_hx);
+    tape.backward(w, grad, batch, &mut d_frames, [&mut d_mu, &mut d_logvar], d_hx);
     parts
 }
 

@@ -134,8 +134,7 @@ impl Tape {
         g: &mut PredictorWeights,
         batch: &Batch,
         d_frames: &mut [f32],
-        d_mu: &mut [f32],
-        d_logvar: &mut [f32],
+        [d_mu, d_logvar]: [&mut [f32]; 2],
         mut d_hx: Vec<f32>,
     ) {
         let w = p.w;

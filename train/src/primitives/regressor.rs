@@ -143,9 +143,8 @@ pub fn body_loss(body: &ShapedBody, c: &[f32], truth: &Truth, share: f32, d: &mu
     for (o, g) in d.iter_mut().zip(d_transl) {
         *o = share * g;
     }
-    for k in 0..BODY_JOINTS {
-        let g = back_6d(&six[k], &d_local[k]);
-        d[3 + 6 * k..9 + 6 * k].iter_mut().zip(g).for_each(|(o, g)| *o = share * g);
+    for ((six, g), d) in six.iter().zip(&d_local).zip(d[3..].chunks_exact_mut(6)) {
+        d.iter_mut().zip(back_6d(six, g)).for_each(|(o, g)| *o = share * g);
     }
     let hands = 3 + 6 * BODY_JOINTS;
     for (o, v) in d[hands..].iter_mut().zip(&c[hands..]) {

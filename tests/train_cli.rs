@@ -186,7 +186,7 @@ fn an_interrupted_run_saves_and_continues() {
     assert_same_run(&whole, &cut, "epoch-0002");
 }
 
-/// A motion model that has learned nothing, and one upright seed.
+/// A motion model that has learned nothing, and one upright seed, once to train and once to test from.
 fn untrained_motion(dir: &Path) {
     let body = BodyModel::embedded();
     let shaped = body.shape(&[0.0; BETAS]);
@@ -202,7 +202,7 @@ fn untrained_motion(dir: &Path) {
     let (p, r) = (init::predictor(predictor, 1, &markers), init::regressor(regressor, 1, &markers, &[0.0; CONTINUOUS]));
     MotionWeights::save(dir, &config, &p, &r).unwrap();
     let seed = SeedMotion { params: [params, params].concat(), betas: [0.0; BETAS] };
-    SeedBank { seeds: vec![seed] }.write(dir.join("seeds.safetensors"), &body).unwrap();
+    SeedBank { seeds: vec![seed.clone(), seed] }.write(dir.join("seeds.safetensors"), &body).unwrap();
 }
 
 #[test]

@@ -331,12 +331,21 @@ impl MotionWeights {
     /// Names the file and entry that is missing, malformed, or not of this program's time base or canonical convention.
     pub fn load(dir: impl AsRef<Path>) -> Result<Self> {
         let dir = dir.as_ref();
+        let read = |name: &str| fs::read(dir.join(name)).map_err(|e| Error::io(dir.join(name), e));
+        Self::from_bytes(dir, read(CONFIG_FILE)?, read(PREDICTOR_FILE)?, read(REGRESSOR_FILE)?)
+    }
+
+    /// Takes the contents of the three files of a folder; `dir` names it in errors.
+    ///
+    /// # Errors
+    /// As [`MotionWeights::load`].
+    pub fn from_bytes(dir: &Path, config: Vec<u8>, predictor: Vec<u8>, regressor: Vec<u8>) -> Result<Self> {
         let path = dir.join(CONFIG_FILE);
-        let text = fs::read(&path).map_err(|e| Error::io(&path, e))?;
+        let text = config;
         let config: MotionConfig = serde_json::from_slice(&text).map_err(|e| Error::file(&path, e.to_string()))?;
         check(&path, &config)?;
-        let p = Tensors::read(dir.join(PREDICTOR_FILE))?;
-        let r = Tensors::read(dir.join(REGRESSOR_FILE))?;
+        let p = Tensors::from_bytes(dir.join(PREDICTOR_FILE), predictor)?;
+        let r = Tensors::from_bytes(dir.join(REGRESSOR_FILE), regressor)?;
         let hash = content_hash([content_hash(&text), p.hash(), r.hash()].concat().as_bytes());
         let predictor = PredictorWeights::read(&p, config.predictor)?;
         let regressor = RegressorWeights::read(&r, config.regressor)?;

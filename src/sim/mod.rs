@@ -3,7 +3,9 @@
 mod people;
 mod seed;
 mod step;
+mod world;
 
 pub use people::{People, Primitives, yaw_towards};
 pub use seed::{SeedBank, SeedMotion};
 pub use step::Sim;
+pub use world::{SEEDS_FILE, World};

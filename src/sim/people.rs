@@ -60,6 +60,25 @@ impl People {
         self.frames.len()
     }
 
+    /// The people with these numbers, in this order; a number may come more than once.
+    ///
+    /// # Panics
+    /// When a number is not below [`People::len`].
+    pub fn select(&self, rows: &[usize]) -> Self {
+        let pick = |from: &[f32]| {
+            let width = from.len() / self.len().max(1);
+            rows.iter().flat_map(|&i| &from[i * width..(i + 1) * width]).copied().collect()
+        };
+        Self {
+            frames: rows.iter().map(|&i| self.frames[i]).collect(),
+            betas: pick(&self.betas),
+            markers: pick(&self.markers),
+            params: pick(&self.params),
+            joints: pick(&self.joints),
+            views: pick(&self.views),
+        }
+    }
+
     /// Whether there is nobody.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()

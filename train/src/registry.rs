@@ -1,17 +1,13 @@
 //! Environments by name.
 
 use crate::{Error, Result};
-use egogen::body::BodyModel;
-use egogen::kernels::MotionEngine;
-use egogen::motion::MotionModel;
-use egogen::sim::{SeedBank, Sim};
+use egogen::sim::World;
 use egogen_envs::VecEnv;
 use egogen_envs::motion::{MotionEnv, MotionTask};
 use egogen_envs::point::PointGoal;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::Arc;
 
 /// A made environment and what it stands on.
 pub struct Made {
@@ -71,39 +67,28 @@ impl Registry {
 }
 
 /// Options of the environment `motion`.
-#[derive(Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 struct MotionOptions {
-    /// Folder of the motion model.
-    #[serde(default = "shipped")]
-    motion: PathBuf,
-    /// Seed motions; without it, those beside the motion model.
-    #[serde(default)]
-    seeds: Option<PathBuf>,
+    /// Folder of a motion model with its seed motions; absent: the shipped one.
+    motion: Option<PathBuf>,
     /// The task.
-    #[serde(default)]
     task: MotionTask,
 }
 
-fn shipped() -> PathBuf {
-    "checkpoints/motion".into()
-}
-
-/// People that walk to a goal round a box.
+/// People that walk to a goal round a box. Tests begin from seed motions that training does not see.
 fn motion(options: &toml::Table, n: usize, purpose: Purpose) -> Result<Made> {
     let bad = |e: toml::de::Error| Error::config(format!("env_options: {}", e.to_string().trim_end()));
     let options: MotionOptions = options.clone().try_into().map_err(bad)?;
     options.task.validate().map_err(|e| Error::config(format!("env_options.task.{e}")))?;
-    let asset = |e: egogen::Error| Error::config(format!("env_options.motion: {e}"));
-    let body = BodyModel::embedded();
-    let model = MotionEngine::load(&options.motion).map_err(asset)?;
-    let seeds = options.seeds.unwrap_or_else(|| options.motion.join("seeds.safetensors"));
-    let bank = Arc::new(SeedBank::read(seeds, &body).map_err(asset)?);
-    let origin = [("motion", model.hash()), ("body", body.hash())].map(|(name, hash)| (name.to_string(), hash.to_string()));
-    let sim = Arc::new(Sim::new(body, Arc::new(model)));
-    let env = match purpose {
-        Purpose::Train => MotionEnv::new(options.task, sim, bank, n, 0),
-        Purpose::Test => MotionEnv::evaluation(options.task, sim, bank, n, 0),
+    let world = match &options.motion {
+        Some(dir) => World::load(dir).map_err(|e| Error::config(format!("env_options.motion: {e}")))?,
+        None => World::embedded()?,
     };
-    Ok(Made { env: Box::new(env?), origin: origin.into() })
+    let (origin, sim) = (world.origin(), world.sim);
+    let env = match purpose {
+        Purpose::Train => MotionEnv::new(options.task, sim, world.train, n, 0),
+        Purpose::Test => MotionEnv::evaluation(options.task, sim, world.held_out, n, 0),
+    };
+    Ok(Made { env: Box::new(env?), origin })
 }

@@ -3,6 +3,7 @@
 use super::predictor::{Ready, Tape};
 use super::sample::normals;
 use super::seeds::make_seeds;
+use crate::evaluate::greedy_cost;
 use egogen::body::{BETAS, BodyModel, MARKER_DIM, PARAMS, ShapedBody, joint};
 use egogen::kernels::{MotionEngine, Regressor};
 use egogen::metrics::{contact_score, foot_heights, kl_to_standard, rigid_marker_error, stance_slide};
@@ -296,8 +297,6 @@ const CANDIDATES: usize = 64;
 /// Steps of an episode, and the distance that counts as arrival.
 const MAX_STEPS: usize = 11;
 const ARRIVED: f32 = 0.1;
-/// Metres that facing away from the goal is worth against being at it.
-const HEADING: f32 = 0.5;
 /// Episodes walked together: bounds the memory.
 const TOGETHER: usize = 20;
 
@@ -345,7 +344,7 @@ fn walk(sim: &Sim, bank: &SeedBank, first: usize, n: usize) -> Result<Vec<(Optio
         if open.is_empty() {
             break;
         }
-        let mut tried = join(&open.iter().map(|&i| pick(&people[i], &[0; CANDIDATES])).collect::<Vec<_>>());
+        let mut tried = join(&open.iter().map(|&i| people[i].select(&[0; CANDIDATES])).collect::<Vec<_>>());
         let z: Vec<f32> = open
             .iter()
             .flat_map(|&i| normals(&mut stream(step as u64, "greedy latents", (first + i) as u64), CANDIDATES * LATENT))
@@ -355,7 +354,7 @@ fn walk(sim: &Sim, bank: &SeedBank, first: usize, n: usize) -> Result<Vec<(Optio
             let range = slot * CANDIDATES..(slot + 1) * CANDIDATES;
             let scores = range.map(|c| (c, score(&tried, &out, c, goals[i])));
             let Some((best, (_, distance))) = scores.min_by(|a, b| a.1.0.total_cmp(&b.1.0)) else { continue };
-            people[i] = pick(&tried, &[best]);
+            people[i] = tried.select(&[best]);
             ends[i] = (if distance < ARRIVED { Some(step) } else { None }, distance);
         }
     }
@@ -369,27 +368,8 @@ fn score(people: &People, out: &Primitives, c: usize, goal: Vec3) -> (f32, f32) 
     let p = out.frames[c].point(Vec3::from_slice(&out.joints[pelvis..]));
     let to = (goal - p).with_z(0.0);
     let distance = to.length();
-    let facing = people.frames[c].rot.y_axis.dot(to.normalize_or_zero());
-    // Close by, the direction to the goal says little.
-    let heading = HEADING * (1.0 - facing) * (distance / 0.5).min(1.0);
-    (if distance < ARRIVED { distance - 10.0 } else { distance + heading }, distance)
-}
-
-/// The people `which` of `from`, in that order.
-fn pick(from: &People, which: &[usize]) -> People {
-    let n = from.len();
-    let rows = |a: &[f32]| -> Vec<f32> {
-        let width = a.len() / n;
-        which.iter().flat_map(|&i| a[i * width..(i + 1) * width].iter().copied()).collect()
-    };
-    People {
-        frames: which.iter().map(|&i| from.frames[i]).collect(),
-        betas: rows(&from.betas),
-        markers: rows(&from.markers),
-        params: rows(&from.params),
-        joints: rows(&from.joints),
-        views: rows(&from.views),
-    }
+    let turn = people.frames[c].rot.y_axis.truncate().angle_to(to.truncate());
+    (if distance < ARRIVED { distance - 10.0 } else { greedy_cost(distance, turn) }, distance)
 }
 
 fn join(parts: &[People]) -> People {

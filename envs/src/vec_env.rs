@@ -1,25 +1,6 @@
 //! The contract between an environment and a trainer.
 
-/// One named part of an observation.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ObsGroup {
-    /// Field name, e.g. "egosensing".
-    pub name: String,
-    /// Shape of the group for one environment, e.g. [2, 32].
-    pub shape: Vec<usize>,
-}
-
-impl ObsGroup {
-    /// Number of floats in the group.
-    pub fn len(&self) -> usize {
-        self.shape.iter().product()
-    }
-
-    /// Whether the group holds no floats.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-}
+pub use egogen::agent::ObsGroup;
 
 /// What an action is.
 #[derive(Clone, Debug, PartialEq, Eq)]

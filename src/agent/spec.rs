@@ -31,6 +31,18 @@ pub struct ObsGroup {
     pub shape: Vec<usize>,
 }
 
+impl ObsGroup {
+    /// Floats of the group.
+    pub fn len(&self) -> usize {
+        self.shape.iter().product()
+    }
+
+    /// Whether the group holds no floats.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
+
 /// The groups in the order in which they lie in an observation row.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -49,7 +61,7 @@ impl ObsLayout {
 
     /// Floats of one observation row.
     pub fn dim(&self) -> usize {
-        self.groups.iter().map(|g| g.shape.iter().product::<usize>()).sum()
+        self.groups.iter().map(ObsGroup::len).sum()
     }
 }
 
@@ -178,7 +190,7 @@ impl PolicySpec {
         let mut start = 0;
         for group in spec.layout.groups.clone() {
             let encoder = spec.encoder(&group, start);
-            start += group.shape.iter().product::<usize>();
+            start += group.len();
             spec.encoders.push(encoder);
         }
         let encoded = spec.encoders.iter().map(|e| e.output).sum();

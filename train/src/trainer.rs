@@ -10,7 +10,7 @@ use crate::registry::{Purpose, Registry};
 use crate::shards::Shards;
 use crate::stats::{Episodes, EpochStats, Row};
 use crate::{AdamW, Error, Result};
-use egogen::agent::{ObsGroup, ObsLayout, PolicySpec, bundle};
+use egogen::agent::{ObsLayout, PolicySpec, bundle};
 use egogen::io::write_atomic;
 use egogen_envs::{ActionSpace, EnvSpec, VecEnv};
 use std::collections::BTreeMap;
@@ -48,8 +48,7 @@ pub fn policy_spec(plan: &Plan, env: &EnvSpec) -> Result<PolicySpec> {
     let ActionSpace::Continuous(action) = env.action else {
         return Err(Error::config(format!("env '{}' has discrete actions; PPO here draws continuous ones", plan.recipe.env)));
     };
-    let groups = env.obs.iter().map(|g| ObsGroup { name: g.name.clone(), shape: g.shape.clone() }).collect();
-    PolicySpec::new(plan.recipe.policy.clone(), ObsLayout::new(groups), action)
+    PolicySpec::new(plan.recipe.policy.clone(), ObsLayout::new(env.obs.clone()), action)
         .map_err(|e| Error::config(format!("recipe '{}': {e}", plan.recipe.name)))
 }
 

@@ -76,6 +76,11 @@ impl MotionEnv {
         Ok(env)
     }
 
+    /// The simulation that moves everyone.
+    pub fn sim(&self) -> &Sim {
+        &self.sim
+    }
+
     /// The task.
     pub fn task(&self) -> &MotionTask {
         &self.task

@@ -142,7 +142,7 @@ impl Member {
 }
 
 /// Non-walkable cells under the axis-aligned box of the markers over both seed frames, in the canonical frame (eq. 7).
-pub(super) fn blocked(task: &MotionTask, people: &People, i: usize, walkable: &Polygon) -> usize {
+pub fn blocked(task: &MotionTask, people: &People, i: usize, walkable: &Polygon) -> usize {
     let markers = &people.markers[i * SEED * MARKER_DIM..][..SEED * MARKER_DIM];
     let start = (Vec2::INFINITY, Vec2::NEG_INFINITY);
     let (lo, hi) = markers.chunks_exact(3).fold(start, |(lo, hi), m| {

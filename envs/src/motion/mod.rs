@@ -11,6 +11,7 @@ mod toy;
 
 pub use config::{MotionTask, Weights};
 pub use env::{MotionEnv, Starts};
+pub use member::blocked;
 pub use rewards::{Outcome, TERMS, Term};
 
 /// Figures of an episode: whether it arrived cleanly, whether it ended by penetration, its steps, the sum of its rewards,

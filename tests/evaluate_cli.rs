@@ -1,0 +1,57 @@
+//! `evaluate`, `play` and `curves` as a user runs them, on the shipped motion model.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+fn run(program: &str, arguments: &[&str], dir: &Path) -> Output {
+    Command::new(program).args(arguments).current_dir(dir).output().expect("the program starts")
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+#[test]
+fn baselines_are_reported_the_same_every_time() {
+    let dir = tempfile::tempdir().unwrap();
+    let report = |out: &str| {
+        let done = run(env!("CARGO_BIN_EXE_evaluate"), &["--episodes", "3", "--out", out], dir.path());
+        assert!(done.status.success(), "{}", text(&done.stderr));
+        assert!(text(&done.stdout).contains("greedy, best of 64"));
+        std::fs::read_to_string(dir.path().join(out).join("report.json")).unwrap()
+    };
+    let first = report("a");
+    assert_eq!(first, report("b"));
+    let json: serde_json::Value = serde_json::from_str(&first).unwrap();
+    assert_eq!(json["rows"].as_array().unwrap().len(), 3);
+    assert!(json["rows"][1]["contact"]["value"].as_f64().unwrap() > 0.5);
+    assert!(json["rows"][1]["kl"].is_null());
+}
+
+#[test]
+fn episodes_become_pictures() {
+    let dir = tempfile::tempdir().unwrap();
+    let done = run(env!("CARGO_BIN_EXE_play"), &["prior", "--starts", "2", "--films", "1", "--out", "pictures"], dir.path());
+    assert!(done.status.success(), "{}", text(&done.stderr));
+    for name in ["paths.png", "start-000-film.png", "start-000-ghosts.png"] {
+        let bytes = std::fs::read(dir.path().join("pictures").join(name)).unwrap();
+        assert!(bytes.starts_with(b"\x89PNG") && bytes.len() > 5000, "{name}");
+    }
+    assert!(!dir.path().join("pictures/start-001-film.png").exists());
+}
+
+#[test]
+fn mistakes_are_told() {
+    let dir = tempfile::tempdir().unwrap();
+    let fails = |program: &str, arguments: &[&str], expected: &str| {
+        let done = run(program, arguments, dir.path());
+        let message = text(&done.stderr);
+        assert!(!done.status.success() && message.contains(expected), "{arguments:?}: {message}");
+    };
+    fails(env!("CARGO_BIN_EXE_evaluate"), &["nowhere", "--no-baselines"], "nowhere");
+    fails(env!("CARGO_BIN_EXE_evaluate"), &["--episodes", "0"], "--episodes");
+    fails(env!("CARGO_BIN_EXE_evaluate"), &["--model", "nowhere"], "nowhere");
+    fails(env!("CARGO_BIN_EXE_play"), &["nowhere"], "nowhere");
+    fails(env!("CARGO_BIN_EXE_curves"), &["nowhere"], "metrics.csv");
+    assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0, "nothing is left behind");
+}

@@ -1,0 +1,101 @@
+//! The program `play`: a policy in its task, as pictures.
+
+use anyhow::{Context, Result};
+use clap::Parser;
+use egogen::agent::bundle::Bundle;
+use egogen::body::BodyModel;
+use egogen::render::{Episode, Image, Walker, tile};
+use egogen::sim::World;
+use egogen_envs::motion::{MotionEnv, MotionTask};
+use egogen_train::evaluate::{Actor, Film, Greedy, Played, play};
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+
+/// Draws episodes of a policy (or of a baseline): a filmstrip and a picture from above of each, and all of them from above.
+#[derive(Debug, Parser)]
+#[command(
+    name = "play",
+    version,
+    after_help = "Examples:
+  play checkpoints/policy/quick --out runs/play
+  play prior --starts 4                     the motion model wandering; also: zero, greedy"
+)]
+struct Args {
+    /// A policy bundle, or one of the baselines zero, prior, greedy
+    policy: String,
+    /// Starts 0 to this, less one, are played
+    #[arg(long, default_value = "12")]
+    starts: NonZeroUsize,
+    /// Of those, this many also get a filmstrip
+    #[arg(long, default_value_t = 2)]
+    films: usize,
+    /// Seed of the starts and of the noise
+    #[arg(long, default_value_t = 2024)]
+    seed: u64,
+    /// Act with the policy's noise instead of its mean action
+    #[arg(long)]
+    stochastic: bool,
+    /// Folder of a motion model instead of the shipped one
+    #[arg(long, value_name = "DIR")]
+    model: Option<PathBuf>,
+    /// Folder for the pictures
+    #[arg(long, value_name = "DIR", default_value = "runs/play")]
+    out: PathBuf,
+}
+
+fn main() -> Result<()> {
+    let args = Args::parse();
+    let world = match &args.model {
+        Some(dir) => World::load(dir)?,
+        None => World::embedded()?,
+    };
+    let mut env = MotionEnv::evaluation(MotionTask::default(), world.sim.clone(), world.held_out.clone(), args.starts.get(), args.seed)?;
+    let actor = match args.policy.as_str() {
+        "zero" => Actor::Zero,
+        "prior" => Actor::Prior,
+        "greedy" => Actor::Greedy(Greedy::default()),
+        dir => {
+            let bundle = Bundle::read(dir.as_ref()).with_context(|| format!("reading the policy {dir}"))?;
+            Actor::policy(&bundle, &env, args.stochastic).with_context(|| format!("policy {dir}"))?
+        }
+    };
+    let reach = env.task().success_distance;
+    let played = play(&mut env, &actor, args.seed, true)?;
+    let body = world.sim.body();
+    let mut plans = Vec::new();
+    for p in &played {
+        let Some(film) = &p.film else { continue };
+        draw(film, reach, |episode| {
+            plans.push(episode.top_view(body, 320)?);
+            if (p.start as usize) < args.films {
+                strips(&episode, body, p, &args.out)?;
+            }
+            Ok(())
+        })?;
+        println!("start {}: {}", p.start, outcome(p));
+    }
+    tile(&plans, 4).write_png(args.out.join("paths.png"))?;
+    println!("pictures in {}", args.out.display());
+    Ok(())
+}
+
+fn draw(film: &Film, reach: f32, picture: impl FnOnce(Episode) -> Result<()>) -> Result<()> {
+    let walkers = [Walker { frames: &film.frames, betas: &film.betas, goal: Some(film.setting.goal) }];
+    picture(Episode { walkers: &walkers, scene: &film.setting.scene, reach })
+}
+
+fn strips(episode: &Episode, body: &BodyModel, p: &Played, out: &std::path::Path) -> Result<()> {
+    let panels: Image = episode.panels(body, 8, 4, 400, 360)?;
+    panels.write_png(out.join(format!("start-{:03}-film.png", p.start)))?;
+    episode.ghosts(body, 9, 1200, 700)?.write_png(out.join(format!("start-{:03}-ghosts.png", p.start)))?;
+    Ok(())
+}
+
+fn outcome(p: &Played) -> String {
+    let how = match (p.figure("success") > 0.5, p.figure("penetration") > 0.5) {
+        (true, _) => "arrived",
+        (_, true) => "hit something",
+        _ => "ran out of time",
+    };
+    format!("{how} after {} steps, {:.2} m from the goal", p.figure("steps"), p.figure("final_dist"))
+}

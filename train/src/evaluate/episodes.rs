@@ -1,0 +1,132 @@
+//! Plays each start once and measures it.
+
+use super::Actor;
+use crate::{Error, Result};
+use egogen::body::{BETAS, MARKER_DIM, PARAMS};
+use egogen::metrics::{contact_score, stance_slide};
+use egogen::motion::{FRAMES, SEED};
+use egogen::scene::Setting;
+use egogen_envs::motion::{EPISODE, MotionEnv};
+use egogen_envs::{StepResult, VecEnv};
+
+/// The recorded motion of one episode.
+#[derive(Clone, Debug, Default)]
+pub struct Film {
+    /// T x 93 bodies in the world, 40 frames per second; the first two frames are the seed.
+    pub frames: Vec<f32>,
+    /// 10 shape coefficients.
+    pub betas: Vec<f32>,
+    /// Where it happened.
+    pub setting: Setting,
+}
+
+/// One episode, measured.
+#[derive(Clone, Debug, Default)]
+pub struct Played {
+    /// Number of the start.
+    pub start: u64,
+    /// The environment's figures, in the order of [`EPISODE`].
+    pub figures: [f32; EPISODE.len()],
+    /// Mean distance between predicted and skinned markers, metres: how far the prediction is from any body.
+    pub body_error: f32,
+    /// Mean foot contact score of its primitives (eq. 12).
+    pub contact: f32,
+    /// Mean slide per stance of its primitives, metres.
+    pub slide: f32,
+    /// Mean per-dimension KL to N(0, I) of the actions, nats; NaN for baselines.
+    pub kl: f32,
+    /// Mean 0.5 mean(mu^2) of the actions; NaN for baselines.
+    pub kl_mean: f32,
+    /// The motion, where it was asked for.
+    pub film: Option<Film>,
+}
+
+impl Played {
+    /// The environment's figure `name`; NaN where there is none of that name.
+    pub fn figure(&self, name: &str) -> f32 {
+        EPISODE.iter().position(|&n| n == name).map_or(f32::NAN, |k| self.figures[k])
+    }
+}
+
+/// Sums over the steps of an episode under way.
+#[derive(Clone, Default)]
+struct Running {
+    steps: f32,
+    sums: [f32; 5],
+    film: Film,
+}
+
+/// The first episode of every environment of `env` (one start each, numbered from 0) with `actor`. `record` keeps the motion.
+pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Result<Vec<Played>> {
+    let n = env.num_envs();
+    let (mut obs, mut result) = (Vec::new(), StepResult::default());
+    env.reset(seed, &mut obs)?;
+    let mut running = vec![Running::default(); n];
+    let mut done: Vec<Option<Played>> = vec![None; n];
+    for (i, r) in running.iter_mut().enumerate() {
+        r.film = Film { frames: vec![], betas: env.people().betas[i * BETAS..(i + 1) * BETAS].to_vec(), setting: env.setting(i).clone() };
+    }
+    for step in 0..u64::from(env.task().max_depth) {
+        let choice = actor.choose(env, &obs, seed, step)?;
+        env.step(&choice.latents, &mut result)?;
+        for i in (0..n).filter(|&i| done[i].is_none()).collect::<Vec<_>>() {
+            let kl = [&choice.kl, &choice.kl_mean].map(|k| k.get(i).copied().unwrap_or(f32::NAN));
+            running[i].add(env, i, kl, record);
+            if result.terminated[i] || result.truncated[i] {
+                let figures = result.episode[i * EPISODE.len()..].first_chunk().copied().unwrap_or_default();
+                done[i] = Some(std::mem::take(&mut running[i]).finish(i as u64, figures, record));
+            }
+        }
+        if done.iter().all(Option::is_some) {
+            break;
+        }
+        std::mem::swap(&mut obs, &mut result.obs);
+    }
+    let missing = done.iter().position(Option::is_none);
+    match missing {
+        Some(i) => Err(Error::run(format!("the episode of start {i} did not end within its step limit"))),
+        None => Ok(done.into_iter().flatten().collect()),
+    }
+}
+
+impl Running {
+    fn add(&mut self, env: &MotionEnv, i: usize, kl: [f32; 2], record: bool) {
+        let prims = env.primitives();
+        let markers = &prims.markers[i * FRAMES * MARKER_DIM..][..FRAMES * MARKER_DIM];
+        let params = &prims.params[i * FRAMES * PARAMS..][..FRAMES * PARAMS];
+        let mut betas = [0.0; BETAS];
+        betas.copy_from_slice(&self.film.betas);
+        let shaped = env.sim().body().shape(&betas);
+        let figures = [body_error(&shaped, markers, params), contact_score(markers), stance_slide(markers), kl[0], kl[1]];
+        self.sums.iter_mut().zip(figures).for_each(|(sum, x)| *sum += x);
+        if record {
+            let from = if self.steps == 0.0 { 0 } else { SEED };
+            for frame in params.chunks_exact(PARAMS).skip(from) {
+                let at = self.film.frames.len();
+                self.film.frames.extend_from_slice(frame);
+                shaped.transform_params(&mut self.film.frames[at..], &prims.frames[i]);
+            }
+        }
+        self.steps += 1.0;
+    }
+
+    fn finish(self, start: u64, figures: [f32; EPISODE.len()], record: bool) -> Played {
+        let [body_error, contact, slide, kl, kl_mean] = self.sums.map(|s| s / self.steps);
+        Played { start, figures, body_error, contact, slide, kl, kl_mean, film: record.then_some(self.film) }
+    }
+}
+
+/// Mean distance of predicted from skinned markers over the predicted frames. The markers that are fed back lie half-way
+/// between the two, so the distance is twice theirs from the skinned ones.
+fn body_error(shaped: &egogen::body::ShapedBody, markers: &[f32], params: &[f32]) -> f32 {
+    let mut skinned = [0.0; MARKER_DIM];
+    let (mut sum, mut count) = (0.0f64, 0);
+    for (m, p) in markers.chunks_exact(MARKER_DIM).zip(params.chunks_exact(PARAMS)).skip(SEED) {
+        shaped.markers(&shaped.pose(p), &mut skinned);
+        for (a, b) in m.chunks_exact(3).zip(skinned.chunks_exact(3)) {
+            sum += 2.0 * f64::from(glam::Vec3::from_slice(a).distance(glam::Vec3::from_slice(b)));
+            count += 1;
+        }
+    }
+    (sum / f64::from(count)) as f32
+}

@@ -1,0 +1,9 @@
+//! Policies and baselines on the same held-out starts: who acts, what is measured, what is reported.
+
+mod actors;
+mod episodes;
+mod report;
+
+pub use actors::{Actor, Greedy, greedy_cost};
+pub use episodes::{Film, Played, play};
+pub use report::{Estimate, Row, mean, proportion, table};

@@ -1,6 +1,6 @@
 """Numbers for the PPO tests, from NumPy and PyTorch alone. Writes ../../fixtures/ppo.safetensors.
 
-    python -m venv /tmp/venv && /tmp/venv/bin/pip install -r requirements.txt && /tmp/venv/bin/python make.py
+    python -m venv venv && venv/bin/pip install -r requirements.txt && venv/bin/python make.py
 """
 from pathlib import Path
 

@@ -1,9 +1,11 @@
 //! The networks must say the same on every device of this build. Run with `--features ndarray` to compare two.
 #![cfg(feature = "ndarray")]
 
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor, TensorData};
 use egogen::DeviceChoice;
 use egogen::agent::{Network, ObsGroup, ObsLayout, PolicyConfig, PolicySpec};
+use egogen::body::{BETAS, BodyModel, MARKER_DIM};
+use egogen::motion::{FUTURE, LATENT, MotionWeights, Predictor, Regressor, SEED};
 use egogen::rng::stream;
 use rand_distr::{Distribution, StandardNormal};
 use std::collections::BTreeMap;
@@ -53,4 +55,29 @@ fn ndarray_agrees_with_flex_on_the_policy() {
     let (ndarray, ndarray_gradient) = outputs_and_gradient(&spec, &flat, &obs, device(DeviceChoice::NdArray));
     assert_close(&flex, &ndarray, "outputs");
     assert_close(&flex_gradient, &ndarray_gradient, "gradients");
+}
+
+/// Two decoded primitives of the shipped predictor and the regressor's estimate for their frames.
+fn motion_outputs(weights: &MotionWeights, device: &Device) -> (Vec<f32>, Vec<f32>) {
+    let draw = |purpose: &str, n: usize| -> Vec<f32> { StandardNormal.sample_iter(stream(2, purpose, 0)).take(n).collect() };
+    let shaped = BodyModel::embedded().shape(&[0.0; BETAS]);
+    // A body at rest stands for a seed; only equal treatment is asked for here.
+    let seed: Vec<f32> = shaped.rest_markers().iter().flat_map(|m| m.to_array()).collect::<Vec<_>>().repeat(4);
+    let predictor = Predictor::new(&weights.predictor, device);
+    let seed = Tensor::<3>::from_data(TensorData::new(seed, [2, SEED, MARKER_DIM]), device);
+    let z = Tensor::<2>::from_data(TensorData::new(draw("latents", 2 * LATENT), [2, LATENT]), device);
+    let frames = predictor.decode(seed, z, FUTURE);
+    let betas = Tensor::<2>::zeros([2 * FUTURE, BETAS], device);
+    let bodies = Regressor::new(&weights.regressor, device).forward(frames.clone().reshape([2 * FUTURE, MARKER_DIM]), betas);
+    let floats = |data: TensorData| data.as_slice::<f32>().expect("outputs are f32").to_vec();
+    (floats(frames.into_data()), floats(bodies.into_data()))
+}
+
+#[test]
+fn ndarray_agrees_with_flex_on_the_motion_model() {
+    let weights = MotionWeights::load(concat!(env!("CARGO_MANIFEST_DIR"), "/checkpoints/motion")).expect("the shipped model is whole");
+    let outputs = |choice: DeviceChoice| motion_outputs(&weights, &choice.device().expect("built in"));
+    let (flex, ndarray) = (outputs(DeviceChoice::Flex), outputs(DeviceChoice::NdArray));
+    assert_close(&flex.0, &ndarray.0, "markers");
+    assert_close(&flex.1, &ndarray.1, "bodies");
 }

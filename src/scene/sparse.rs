@@ -36,7 +36,8 @@ pub struct SparseScenes {
     pub clearance: f32,
     /// Starts lie within the axis-aligned bounds of the box grown by this much, metres.
     pub margin: f32,
-    /// Longest straight distance from start to goal, metres.
+    /// Shortest and longest straight distance from start to goal, metres.
+    pub min_distance: f32,
     pub max_distance: f32,
     /// Standard deviation added to each coordinate of the goal, which otherwise is the start mirrored at the origin, metres.
     pub goal_noise: f32,
@@ -51,6 +52,7 @@ impl Default for SparseScenes {
             wall: [4.5, 5.0],
             clearance: 0.4,
             margin: 1.0,
+            min_distance: 0.0,
             max_distance: 4.0,
             goal_noise: 0.0,
         }
@@ -74,7 +76,8 @@ impl SparseScenes {
             if ok { Ok(()) } else { Err(Error::invalid(format!("scene.{key}: expected {right}"))) }
         };
         let range = |r: [f32; 2]| r[0] > 0.0 && r[0] <= r[1] && r[1].is_finite();
-        let finite = [self.height, self.clearance, self.margin, self.max_distance, self.goal_noise].iter().all(|v| v.is_finite());
+        let finite =
+            [self.height, self.clearance, self.margin, self.min_distance, self.max_distance, self.goal_noise].iter().all(|v| v.is_finite());
         need(finite, "*", "finite numbers")?;
         need(range(self.side), "side", "[low, high] with 0 < low <= high")?;
         need(range(self.wall), "wall", "[low, high] with 0 < low <= high")?;
@@ -83,6 +86,7 @@ impl SparseScenes {
         need(self.margin > self.clearance, "margin", &format!("more than the clearance of {} m", self.clearance))?;
         // The nearest starts lie beside the middle of the longest side or, at worst, at a corner.
         let reach = 2.0 * (self.side[1] * std::f32::consts::FRAC_1_SQRT_2 + self.clearance);
+        need((0.0..self.max_distance).contains(&self.min_distance), "min_distance", "0 or more, less than max_distance")?;
         need(self.max_distance > reach, "max_distance", &format!("more than {reach:.2} m, through the largest box"))?;
         let far = self.max_distance / 2.0 + 4.0 * self.goal_noise + self.clearance;
         need(self.wall[0] > far, "wall", &format!("more than {far:.2} m, so that every goal lies within"))?;
@@ -108,7 +112,7 @@ impl SparseScenes {
             let start = Vec2::new(rng.random_range(-bound.x..=bound.x), rng.random_range(-bound.y..=bound.y));
             let goal = -start + Vec2::new(noise.sample(rng), noise.sample(rng));
             let free = block.distance(start) >= self.clearance && block.distance(goal) >= self.clearance;
-            if free && start.distance(goal) <= self.max_distance {
+            if free && (self.min_distance..=self.max_distance).contains(&start.distance(goal)) {
                 return Ok((start, goal));
             }
         }
@@ -176,6 +180,7 @@ mod tests {
             (SparseScenes { side: [1.0, 0.5], ..base() }, "scene.side"),
             (SparseScenes { margin: 0.4, ..base() }, "scene.margin"),
             (SparseScenes { max_distance: 2.0, ..base() }, "scene.max_distance"),
+            (SparseScenes { min_distance: 4.0, ..base() }, "scene.min_distance"),
             (SparseScenes { wall: [2.0, 5.0], ..base() }, "scene.wall"),
             (SparseScenes { height: f32::NAN, ..base() }, "scene.*"),
         ];

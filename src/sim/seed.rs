@@ -35,6 +35,12 @@ pub struct SeedBank {
 }
 
 impl SeedBank {
+    /// The first half, to train from, and the second, to test from.
+    pub fn halves(mut self) -> (Self, Self) {
+        let second = self.seeds.split_off(self.seeds.len() / 2);
+        (self, Self { seeds: second })
+    }
+
     /// Reads the bank at `path`: `params` (S, 2, 93) and `betas` (S, 10). Refuses one made with another body than `body`.
     pub fn read(path: impl AsRef<Path>, body: &BodyModel) -> Result<Self> {
         Self::from_tensors(&Tensors::read(path)?, body)

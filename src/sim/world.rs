@@ -54,7 +54,7 @@ impl World {
         hashes.into_iter().map(|(name, hash)| (name.to_string(), hash.to_string())).collect()
     }
 
-    fn new(dir: &Path, body: Arc<BodyModel>, weights: MotionWeights, mut seeds: SeedBank) -> Result<Self> {
+    fn new(dir: &Path, body: Arc<BodyModel>, weights: MotionWeights, seeds: SeedBank) -> Result<Self> {
         if weights.config.body != body.hash() {
             let what = format!("body is '{}', but the body here is '{}'; train the motion model on it", weights.config.body, body.hash());
             return Err(Error::file(dir.join(CONFIG_FILE), what));
@@ -62,9 +62,9 @@ impl World {
         if seeds.seeds.len() < 2 {
             return Err(Error::file(dir.join(SEEDS_FILE), "holds one seed motion, expected some to train and some to test from"));
         }
-        let held_out = seeds.seeds.split_off(seeds.seeds.len() / 2);
+        let (train, held_out) = seeds.halves();
         let sim = Arc::new(Sim::new(body, Arc::new(MotionEngine::new(&weights)?)));
-        Ok(Self { sim, train: Arc::new(seeds), held_out: Arc::new(SeedBank { seeds: held_out }) })
+        Ok(Self { sim, train: Arc::new(train), held_out: Arc::new(held_out) })
     }
 }
 

@@ -1,5 +1,6 @@
 //! The program `train`.
 
+use crate::program::{self, INTERRUPTED};
 use crate::recipe::{EMBEDDED, Plan, Recipe, of_run};
 use crate::registry::{Purpose, Registry};
 use crate::trainer::{Outcome, Trainer, policy_spec};
@@ -9,9 +10,6 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-
-/// Exit code of a run that was interrupted and saved.
-const INTERRUPTED: u8 = 130;
 
 /// Trains a policy from a recipe.
 #[derive(Debug, Parser)]
@@ -63,13 +61,7 @@ pub fn run(registry: &Registry) -> ExitCode {
             return ExitCode::from(e.exit_code() as u8);
         }
     };
-    match act(&args, registry) {
-        Ok(code) => ExitCode::from(code),
-        Err(e) => {
-            eprintln!("error: {e}");
-            ExitCode::from(e.exit_code())
-        }
-    }
+    program::exit(act(&args, registry))
 }
 
 fn act(args: &Args, registry: &Registry) -> Result<u8> {

@@ -14,6 +14,7 @@ mod optim;
 mod policy;
 mod ppo;
 pub mod primitives;
+pub mod program;
 pub mod recipe;
 pub mod registry;
 mod shards;

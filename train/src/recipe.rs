@@ -205,6 +205,19 @@ fn set(table: &mut toml::Table, change: &str) -> Result<()> {
     Ok(())
 }
 
+/// `base` with `key.path=value` changes; `what` names it in errors.
+pub fn changed<T: Serialize + serde::de::DeserializeOwned>(what: &str, base: T, changes: &[String]) -> Result<T> {
+    if changes.is_empty() {
+        return Ok(base);
+    }
+    let bad = |e: String| Error::config(format!("{what} with --set {}: {}", changes.join(" --set "), e.trim_end()));
+    let mut table = toml::Table::try_from(&base).map_err(|e| bad(e.to_string()))?;
+    for change in changes {
+        set(&mut table, change)?;
+    }
+    table.try_into().map_err(|e: toml::de::Error| bad(e.to_string()))
+}
+
 /// Reads the resolved recipe of the run in `dir`, with changes that a continued run may make.
 pub fn of_run(dir: &Path, changes: &[String]) -> Result<Recipe> {
     const MAY: [&str; 3] = ["run.epochs", "checkpoint.", "test."];

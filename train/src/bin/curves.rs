@@ -1,10 +1,12 @@
 //! The program `curves`: learning curves of runs as one SVG picture, baselines as horizontal lines.
 
-use anyhow::{Context, Result, bail};
 use clap::Parser;
 use egogen::io::write_atomic;
 use egogen_train::curves::{Baseline, Run, draw};
+use egogen_train::program::{self, Given};
+use egogen_train::{Error, Result};
 use std::path::PathBuf;
+use std::process::ExitCode;
 
 /// Draws return, success, hover rate, final distance and KL to the prior of one or several runs.
 #[derive(Debug, Parser)]
@@ -26,16 +28,19 @@ struct Args {
     out: PathBuf,
 }
 
-fn main() -> Result<()> {
-    let args = Args::parse();
-    let runs = args.runs.iter().map(|dir| Run::read(dir)).collect::<Result<Vec<_>, _>>()?;
+fn main() -> ExitCode {
+    program::exit(run(&Args::parse()))
+}
+
+fn run(args: &Args) -> Result<u8> {
+    let runs = args.runs.iter().map(|dir| Run::read(dir)).collect::<std::result::Result<Vec<_>, _>>().given()?;
     let baselines = match &args.baselines {
-        Some(path) => Baseline::read(path)?,
+        Some(path) => Baseline::read(path).given()?,
         None => vec![],
     };
     if runs.iter().all(|r| r.rows() == 0) {
-        bail!("none of the runs has a finished epoch");
+        return Err(Error::config("none of the runs has a finished epoch"));
     }
-    let svg = draw(&runs, &baselines).context("drawing")?;
-    Ok(write_atomic(&args.out, svg.as_bytes())?)
+    write_atomic(&args.out, draw(&runs, &baselines)?.as_bytes())?;
+    Ok(0)
 }

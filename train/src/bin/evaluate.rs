@@ -1,14 +1,15 @@
 //! The program `evaluate`: policies and baselines on the same held-out starts.
 
-use anyhow::{Context, Result};
 use clap::Parser;
 use egogen::agent::bundle::Bundle;
 use egogen::io::write_atomic;
-use egogen::sim::World;
-use egogen_envs::motion::{MotionEnv, MotionTask};
+use egogen_envs::motion::MotionEnv;
 use egogen_train::evaluate::{Actor, Greedy, Row, play, table};
+use egogen_train::program::{self, Given};
+use egogen_train::{Error, Result};
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
+use std::process::ExitCode;
 
 /// Plays policies and baselines from the same held-out starts and reports figures with 95 % intervals.
 #[derive(Debug, Parser)]
@@ -18,8 +19,9 @@ use std::path::PathBuf;
     after_help = "Examples:
   evaluate checkpoints/policy/quick --out runs/evaluation     a policy beside the three baselines
   evaluate runs/quick/policy runs/other/policy --episodes 500
+  evaluate --set scene.kind=open --set scene.min_distance=2     baselines where nothing is in the way
 
-Exit codes: 0 done, 1 failed while running, 2 bad usage."
+Exit codes: 0 done, 1 failed while running, 2 bad usage, task, model or policy."
 )]
 struct Args {
     /// Policy bundles; each is played with its noise and with its mean action
@@ -33,6 +35,9 @@ struct Args {
     /// Folder of a motion model instead of the shipped one
     #[arg(long, value_name = "DIR")]
     model: Option<PathBuf>,
+    /// Change a value of the walking task, e.g. scene.kind=open; repeatable
+    #[arg(long = "set", value_name = "KEY.PATH=VALUE")]
+    set: Vec<String>,
     /// Leave the baselines out
     #[arg(long)]
     no_baselines: bool,
@@ -41,14 +46,14 @@ struct Args {
     out: PathBuf,
 }
 
-fn main() -> Result<()> {
-    let args = Args::parse();
+fn main() -> ExitCode {
+    program::exit(run(&Args::parse()))
+}
+
+fn run(args: &Args) -> Result<u8> {
     let episodes = args.episodes.get();
-    let world = match &args.model {
-        Some(dir) => World::load(dir)?,
-        None => World::embedded()?,
-    };
-    let task = MotionTask::default();
+    let world = program::world(args.model.as_deref())?;
+    let task = program::task(&args.set)?;
     let mut env = MotionEnv::evaluation(task, world.sim.clone(), world.held_out.clone(), episodes, args.seed)?;
     let mut actors: Vec<(String, Actor)> = Vec::new();
     if !args.no_baselines {
@@ -58,10 +63,10 @@ fn main() -> Result<()> {
         actors.push((format!("greedy, best of {}", greedy.candidates), Actor::Greedy(greedy)));
     }
     for dir in &args.policies {
-        let bundle = Bundle::read(dir).with_context(|| format!("reading the policy {}", dir.display()))?;
+        let bundle = Bundle::read(dir).given()?;
         let name = if bundle.trained.recipe.is_empty() { dir.display().to_string() } else { bundle.trained.recipe.clone() };
         for (noise, how) in [(true, "stochastic"), (false, "deterministic")] {
-            let actor = Actor::policy(&bundle, &env, noise).with_context(|| format!("policy {}", dir.display()))?;
+            let actor = Actor::policy(&bundle, &env, noise).map_err(|e| Error::config(format!("policy {}: {e}", dir.display())))?;
             actors.push((format!("{name}, {how}"), actor));
         }
     }
@@ -72,8 +77,10 @@ fn main() -> Result<()> {
     }
     let text = table(&rows);
     println!("{text}");
-    let json = serde_json::json!({ "episodes": episodes, "seed": args.seed, "origin": world.origin(), "rows": rows });
-    write_atomic(args.out.join("report.json"), serde_json::to_string_pretty(&json)?.as_bytes())?;
+    let json = serde_json::json!({
+        "episodes": episodes, "seed": args.seed, "task": env.task(), "origin": world.origin(), "rows": rows,
+    });
+    write_atomic(args.out.join("report.json"), format!("{json:#}").as_bytes())?;
     write_atomic(args.out.join("report.md"), text.as_bytes())?;
-    Ok(())
+    Ok(0)
 }

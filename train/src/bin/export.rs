@@ -2,6 +2,7 @@
 
 use clap::Parser;
 use egogen_train::checkpoint::list;
+use egogen_train::program;
 use egogen_train::trainer::export;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -30,14 +31,8 @@ fn main() -> ExitCode {
         Some(newest) => root.join(newest),
         None => args.from,
     };
-    match export(&from, &args.out) {
-        Ok(()) => {
-            eprintln!("{} packed into {}", from.display(), args.out.display());
-            ExitCode::SUCCESS
-        }
-        Err(e) => {
-            eprintln!("error: {e}");
-            ExitCode::from(e.exit_code())
-        }
-    }
+    program::exit(export(&from, &args.out).map(|()| {
+        eprintln!("{} packed into {}", from.display(), args.out.display());
+        0
+    }))
 }

@@ -1,15 +1,16 @@
 //! The program `play`: a policy in its task, as pictures.
 
-use anyhow::{Context, Result};
 use clap::Parser;
 use egogen::agent::bundle::Bundle;
 use egogen::body::BodyModel;
 use egogen::render::{Episode, Image, Walker, tile};
-use egogen::sim::World;
-use egogen_envs::motion::{MotionEnv, MotionTask};
+use egogen_envs::motion::MotionEnv;
 use egogen_train::evaluate::{Actor, Film, Greedy, Played, play};
+use egogen_train::program::{self, Given};
+use egogen_train::{Error, Result};
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
+use std::process::ExitCode;
 
 /// Draws episodes of a policy (or of a baseline): a filmstrip and a picture from above of each, and all of them from above.
 #[derive(Debug, Parser)]
@@ -38,25 +39,29 @@ struct Args {
     /// Folder of a motion model instead of the shipped one
     #[arg(long, value_name = "DIR")]
     model: Option<PathBuf>,
+    /// Change a value of the walking task, e.g. scene.kind=open; repeatable
+    #[arg(long = "set", value_name = "KEY.PATH=VALUE")]
+    set: Vec<String>,
     /// Folder for the pictures
     #[arg(long, value_name = "DIR", default_value = "runs/play")]
     out: PathBuf,
 }
 
-fn main() -> Result<()> {
-    let args = Args::parse();
-    let world = match &args.model {
-        Some(dir) => World::load(dir)?,
-        None => World::embedded()?,
-    };
-    let mut env = MotionEnv::evaluation(MotionTask::default(), world.sim.clone(), world.held_out.clone(), args.starts.get(), args.seed)?;
+fn main() -> ExitCode {
+    program::exit(run(&Args::parse()))
+}
+
+fn run(args: &Args) -> Result<u8> {
+    let world = program::world(args.model.as_deref())?;
+    let mut env =
+        MotionEnv::evaluation(program::task(&args.set)?, world.sim.clone(), world.held_out.clone(), args.starts.get(), args.seed)?;
     let actor = match args.policy.as_str() {
         "zero" => Actor::Zero,
         "prior" => Actor::Prior,
         "greedy" => Actor::Greedy(Greedy::default()),
         dir => {
-            let bundle = Bundle::read(dir.as_ref()).with_context(|| format!("reading the policy {dir}"))?;
-            Actor::policy(&bundle, &env, args.stochastic).with_context(|| format!("policy {dir}"))?
+            let bundle = Bundle::read(dir.as_ref()).given()?;
+            Actor::policy(&bundle, &env, args.stochastic).map_err(|e| Error::config(format!("policy {dir}: {e}")))?
         }
     };
     let reach = env.task().success_distance;
@@ -76,7 +81,7 @@ fn main() -> Result<()> {
     }
     tile(&plans, 4).write_png(args.out.join("paths.png"))?;
     println!("pictures in {}", args.out.display());
-    Ok(())
+    Ok(0)
 }
 
 fn draw(film: &Film, reach: f32, picture: impl FnOnce(Episode) -> Result<()>) -> Result<()> {

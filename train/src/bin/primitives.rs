@@ -1,6 +1,5 @@
 //! Trains and judges the motion-primitive model.
 
-use anyhow::{Context, Result};
 use clap::{Args, Parser, Subcommand};
 use egogen::body::BodyModel;
 use egogen::io::write_atomic;
@@ -10,6 +9,8 @@ use egogen::sim::Sim;
 use egogen_train::primitives::eval::{Effort, evaluate};
 use egogen_train::primitives::fit::{Outcome, Run, Settings};
 use egogen_train::primitives::seeds::make_seeds;
+use egogen_train::program::{self, Given, INTERRUPTED};
+use egogen_train::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -99,45 +100,52 @@ struct Train {
     resume: bool,
 }
 
-fn main() -> Result<ExitCode> {
-    match Cli::parse().command {
+fn main() -> ExitCode {
+    program::exit(run(Cli::parse().command))
+}
+
+fn run(command: Command) -> Result<u8> {
+    match command {
         Command::Train(args) => train(args),
         Command::Eval(args) => {
             let body = BodyModel::embedded();
-            let (set, held_out, _) = motion::build(&args.data.data, args.data.data_seed, &body)?;
+            let (set, held_out, _) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
             judge(&args.model, &body, &set, &held_out, Effort { people: args.people, episodes: args.episodes })?;
-            Ok(ExitCode::SUCCESS)
+            Ok(0)
         }
         Command::Seeds(args) => {
             let body = BodyModel::embedded();
-            let (set, ..) = motion::build(&args.data.data, args.data.data_seed, &body)?;
+            let (set, ..) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
             write_seeds(&args.model, &body, &set)?;
-            Ok(ExitCode::SUCCESS)
+            Ok(0)
         }
     }
 }
 
 fn judge(model: &Path, body: &Arc<BodyModel>, set: &MotionSet, held_out: &MotionSet, effort: Effort) -> Result<()> {
-    let report = evaluate(&MotionWeights::load(model)?, body, set, held_out, effort)?;
+    let report = evaluate(&MotionWeights::load(model).given()?, body, set, held_out, effort)?;
     println!("{report}");
-    write_atomic(model.join("metrics.json"), format!("{}\n", serde_json::to_string_pretty(&report)?).as_bytes())?;
+    write_atomic(
+        model.join("metrics.json"),
+        format!("{}\n", serde_json::to_string_pretty(&report).map_err(|e| Error::run(e.to_string()))?).as_bytes(),
+    )?;
     Ok(())
 }
 
 fn write_seeds(model: &Path, body: &Arc<BodyModel>, set: &MotionSet) -> Result<()> {
-    let sim = Sim::new(body.clone(), Arc::new(MotionEngine::load(model)?));
+    let sim = Sim::new(body.clone(), Arc::new(MotionEngine::load(model).given()?));
     let bank = make_seeds(&sim, set)?;
     bank.write(model.join("seeds.safetensors"), body)?;
     eprintln!("{} seeds", bank.seeds.len());
     Ok(())
 }
 
-fn train(args: Train) -> Result<ExitCode> {
+fn train(args: Train) -> Result<u8> {
     let body = BodyModel::embedded();
-    let (set, held_out, report) = motion::build(&args.data.data, args.data.data_seed, &body)?;
+    let (set, held_out, report) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
     eprintln!("{report}");
     let mut run = if args.resume {
-        Run::resume(&set, &body, &args.out)?
+        Run::resume(&set, &body, &args.out).given()?
     } else {
         let mut settings = Settings { seed: args.seed, minutes: args.minutes, ..Default::default() };
         settings.loss.kl = args.kl.unwrap_or(settings.loss.kl);
@@ -145,18 +153,18 @@ fn train(args: Train) -> Result<ExitCode> {
         settings.loss.contact = args.contact.unwrap_or(settings.loss.contact);
         let fresh = Run::new(&set, &body, settings, &args.out);
         match &args.start_from {
-            Some(dir) => fresh.start_from(dir)?,
+            Some(dir) => fresh.start_from(dir).given()?,
             None => fresh,
         }
     };
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed)).context("cannot listen for Ctrl-C")?;
+    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed)).map_err(|e| Error::run(format!("cannot watch for Ctrl-C: {e}")))?;
     if run.train(&stop)? == Outcome::Interrupted {
         eprintln!("interrupted; state saved in {}, go on with --resume", run.folder().display());
-        return Ok(ExitCode::from(130));
+        return Ok(INTERRUPTED);
     }
     write_seeds(run.folder(), &body, &set)?;
     judge(run.folder(), &body, &set, &held_out, EFFORT)?;
-    Ok(ExitCode::SUCCESS)
+    Ok(0)
 }

@@ -2,9 +2,9 @@
 
 use crate::{Compute, Policy, Result};
 use egogen::agent::bundle::Bundle;
-use egogen::body::{canonical_frame, joint};
+use egogen::body::{JOINTS, canonical_frame, joint};
 use egogen::metrics::{kl_mean_only, kl_to_standard};
-use egogen::motion::SEED;
+use egogen::motion::{FUTURE, SEED};
 use egogen::rng::stream;
 use egogen::sim::{People, Primitives};
 use egogen_envs::motion::{MotionEnv, blocked};
@@ -45,8 +45,8 @@ impl Actor {
         Ok(Self::Policy { policy: Box::new(Policy::new(&bundle.spec, &bundle.params, &Compute::Own)?), noise })
     }
 
-    /// Latents for everyone in `env`, who sees `obs`. `seed` and `step` fix the noise.
-    pub fn choose(&self, env: &MotionEnv, obs: &[f32], seed: u64, step: u64) -> Result<Choice> {
+    /// Latents for everyone in `env`, who sees `obs`; people not `playing` any more may get any. `seed` and `step` fix the noise.
+    pub fn choose(&self, env: &MotionEnv, obs: &[f32], playing: &[bool], seed: u64, step: u64) -> Result<Choice> {
         let people = env.people();
         let dim = env.sim().model().latent_dim();
         match self {
@@ -61,7 +61,7 @@ impl Actor {
             }
             Self::Zero => Ok(Choice { latents: vec![0.0; people.len() * dim], ..Default::default() }),
             Self::Prior => Ok(Choice { latents: normal(people.len(), dim, seed, step), ..Default::default() }),
-            Self::Greedy(greedy) => Ok(Choice { latents: greedy.choose(env, seed, step)?, ..Default::default() }),
+            Self::Greedy(greedy) => Ok(Choice { latents: greedy.choose(env, playing, seed, step)?, ..Default::default() }),
         }
     }
 }
@@ -87,12 +87,12 @@ impl Default for Greedy {
 }
 
 impl Greedy {
-    fn choose(&self, env: &MotionEnv, seed: u64, step: u64) -> Result<Vec<f32>> {
+    fn choose(&self, env: &MotionEnv, playing: &[bool], seed: u64, step: u64) -> Result<Vec<f32>> {
         let (n, dim) = (env.people().len(), env.sim().model().latent_dim());
-        let mut chosen = Vec::with_capacity(n * dim);
+        let mut chosen = vec![0.0; n * dim];
         let mut prims = Primitives::default();
-        for first in (0..n).step_by(self.at_once) {
-            let group: Vec<usize> = (first..n.min(first + self.at_once)).collect();
+        let who: Vec<usize> = (0..n).filter(|&i| playing[i]).collect();
+        for group in who.chunks(self.at_once) {
             let rows: Vec<usize> = group.iter().flat_map(|&i| std::iter::repeat_n(i, self.candidates)).collect();
             let mut people = env.people().select(&rows);
             let latents: Vec<f32> = group.iter().flat_map(|&i| normal(self.candidates, dim, seed, step * n as u64 + i as u64)).collect();
@@ -101,32 +101,73 @@ impl Greedy {
                 let cost = |k: usize| self.cost(env, i, &people, g * self.candidates + k);
                 let best = (0..self.candidates).min_by(|&a, &b| cost(a).total_cmp(&cost(b))).unwrap_or(0);
                 let at = (g * self.candidates + best) * dim;
-                chosen.extend_from_slice(&latents[at..at + dim]);
+                chosen[i * dim..(i + 1) * dim].copy_from_slice(&latents[at..at + dim]);
             }
         }
         Ok(chosen)
     }
 
-    /// Distance left after the step plus what the turn towards the goal will cost; a step that hits something comes last.
+    /// See [`greedy_cost`]; a step that arrives comes first, one that hits something last.
     fn cost(&self, env: &MotionEnv, i: usize, people: &People, row: usize) -> f32 {
-        let setting = env.setting(i);
-        let hits = blocked(env.task(), people, row, &setting.scene.walkable) >= env.task().blocked_cells;
-        let (at, forward) = stance(people, row);
-        let to = setting.goal - at;
-        greedy_cost(to.length(), forward.angle_to(to)) + if hits { 1e3 } else { 0.0 }
+        let (setting, task) = (env.setting(i), env.task());
+        let stance = Stance::of(people, row);
+        let to = setting.goal - stance.at;
+        if blocked(task, people, row, &setting.scene.walkable) >= task.blocked_cells {
+            1e3 + to.length()
+        } else if to.length() < task.success_distance {
+            to.length() - 1e3
+        } else {
+            greedy_cost(to.length(), stance.forward.angle_to(to), stance.stride)
+        }
     }
 }
 
-/// What being `distance` metres from the goal and turned away from it by `turn` radians costs a greedy walker, metres.
-/// Facing away costs a metre; close by, the direction to the goal says little.
-pub fn greedy_cost(distance: f32, turn: f32) -> f32 {
-    distance + 0.5 * (1.0 - turn.cos()) * (distance / 0.5).min(1.0)
+/// Strides shorter than this count as this, metres: who stands can still begin to walk.
+const LEAST_STRIDE: f32 = 0.2;
+
+/// What it costs a greedy walker to be `distance` metres from the goal, turned away from it by `turn` radians, going on by
+/// `stride` metres a step; metres.
+///
+/// Only where steps end counts as arriving, so whoever strides across the goal has missed it: what is left should be a whole
+/// number of strides. Facing away costs half a metre; close by, the direction to the goal says little.
+fn greedy_cost(distance: f32, turn: f32, stride: f32) -> f32 {
+    let stride = stride.max(LEAST_STRIDE);
+    let strides = (distance / stride).round().max(1.0);
+    0.5 * distance + 0.5 * (1.0 - turn.cos()) * (distance / 0.5).min(1.0) + (distance / strides - stride).abs()
 }
 
-/// Where person `i` stands at the end of its seed and which way the hips face, in the world's plane.
-fn stance(people: &People, i: usize) -> (Vec2, Vec2) {
-    let at = |j: usize| Vec3::from_slice(&people.joints[((i * SEED + SEED - 1) * egogen::body::JOINTS + j) * 3..]);
-    let local = canonical_frame(at(joint::PELVIS), at(joint::L_HIP), at(joint::R_HIP));
-    let world = people.frames[i].compose(&local);
-    (world.transl.truncate(), world.rot.y_axis.truncate())
+/// How a person stands at the end of its seed, in the world's plane.
+struct Stance {
+    at: Vec2,
+    /// Where the hips face.
+    forward: Vec2,
+    /// The way of one more step at the present speed, metres.
+    stride: f32,
+}
+
+impl Stance {
+    fn of(people: &People, i: usize) -> Self {
+        let at = |t: usize, j: usize| Vec3::from_slice(&people.joints[((i * SEED + t) * JOINTS + j) * 3..]);
+        let end = |j: usize| at(SEED - 1, j);
+        let world = people.frames[i].compose(&canonical_frame(end(joint::PELVIS), end(joint::L_HIP), end(joint::R_HIP)));
+        let moved = (end(joint::PELVIS) - at(SEED - 2, joint::PELVIS)).truncate().length();
+        Self { at: world.transl.truncate(), forward: world.rot.y_axis.truncate(), stride: moved * FUTURE as f32 }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn greedy_costs_by_hand() {
+        // One metre ahead in strides of 0.5: no correction.
+        assert!((greedy_cost(1.0, 0.0, 0.5) - 0.5).abs() < 1e-6);
+        // Two strides of 0.4 leave 0.2, so both must grow by 0.1; three would have to shrink.
+        assert!((greedy_cost(1.0, 0.0, 0.4) - 0.6).abs() < 1e-6);
+        // Facing away from 0.25 m: half of half a metre twice, and the one stride of 0.6 is 0.35 too long.
+        assert!((greedy_cost(0.25, std::f32::consts::PI, 0.6) - (0.125 + 0.5 + 0.35)).abs() < 1e-6);
+        // Standing counts as strides of 0.2.
+        assert!((greedy_cost(0.3, 0.0, 0.0) - (0.15 + 0.05)).abs() < 1e-6);
+    }
 }

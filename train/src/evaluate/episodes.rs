@@ -67,7 +67,7 @@ pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Resu
         r.film = Film { frames: vec![], betas: env.people().betas[i * BETAS..(i + 1) * BETAS].to_vec(), setting: env.setting(i).clone() };
     }
     for step in 0..u64::from(env.task().max_depth) {
-        let choice = actor.choose(env, &obs, seed, step)?;
+        let choice = actor.choose(env, &obs, &done.iter().map(Option::is_none).collect::<Vec<_>>(), seed, step)?;
         env.step(&choice.latents, &mut result)?;
         for i in (0..n).filter(|&i| done[i].is_none()).collect::<Vec<_>>() {
             let kl = [&choice.kl, &choice.kl_mean].map(|k| k.get(i).copied().unwrap_or(f32::NAN));

@@ -4,6 +4,6 @@ mod actors;
 mod episodes;
 mod report;
 
-pub use actors::{Actor, Greedy, greedy_cost};
+pub use actors::{Actor, Greedy};
 pub use episodes::{Film, Played, play};
 pub use report::{Estimate, Row, mean, proportion, table};

@@ -3,6 +3,7 @@
 pub mod adam;
 pub mod eval;
 pub mod fit;
+pub mod gait;
 pub mod init;
 pub mod layers;
 pub mod loss;

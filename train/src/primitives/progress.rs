@@ -1,9 +1,10 @@
 //! What a run says while it runs: a bar (or lines, away from a terminal) and a CSV file.
 
 use super::fit::Stage;
+use egogen::io::write_atomic;
 use egogen::{Error, Result};
 use indicatif::{ProgressBar, ProgressStyle};
-use std::fs::{File, OpenOptions};
+use std::fs::{self, File, OpenOptions};
 use std::io::{IsTerminal, Write, stderr};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -28,19 +29,21 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// Progress of `stage`; appends to `<stage>.csv` in `out` if the stage goes on at `step` > 0.
+    /// Progress of `stage`; goes on with `<stage>.csv` in `out` if the stage goes on at `step` > 0.
     pub fn new(out: &Path, stage: Stage, step: u64) -> Result<Self> {
         let names: &[&str] = match stage {
             Stage::Body => &["loss", "marker_distance"],
             _ => &["reconstruction", "velocity", "kl", "skate", "contact"],
         };
         let path = out.join(format!("{}.csv", format!("{stage:?}").to_lowercase()));
-        std::fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;
-        let open = OpenOptions::new().create(true).write(true).append(step > 0).truncate(step == 0).open(&path);
-        let mut file = open.map_err(|e| Error::io(&path, e))?;
-        if step == 0 {
-            writeln!(file, "step,rate,{}", names.join(",")).map_err(|e| Error::io(&path, e))?;
-        }
+        fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;
+        let header = format!("step,rate,{}\n", names.join(","));
+        // Rows after the state that a continued stage goes on from will come again.
+        let kept = if step > 0 { fs::read_to_string(&path).unwrap_or_default() } else { String::new() };
+        let earlier = |row: &&str| row.split(',').next().and_then(|s| s.parse().ok()).is_some_and(|s: u64| s <= step);
+        let rows: String = kept.lines().filter(earlier).flat_map(|row| [row, "\n"]).collect();
+        write_atomic(&path, (header + &rows).as_bytes())?;
+        let file = OpenOptions::new().append(true).open(&path).map_err(|e| Error::io(&path, e))?;
         let bar = stderr().is_terminal().then(|| {
             let style = ProgressStyle::with_template("{prefix:8} {wide_bar} {percent}% {msg}").unwrap_or(ProgressStyle::default_bar());
             ProgressBar::new(1000).with_style(style).with_prefix(format!("{stage:?}"))

@@ -1,6 +1,6 @@
 //! Seeds for the walking task, made by the model itself.
 
-use super::eval::start_people;
+use super::gait::start_people;
 use super::sample::normals;
 use egogen::Result;
 use egogen::body::{BETAS, JOINTS, MARKER_DIM, PARAMS, joint};

@@ -80,6 +80,29 @@ fn a_resumed_run_and_another_thread_count_give_the_same_bytes() {
     assert_same_run(&whole, &parts, "epoch-0004");
 }
 
+/// Options whose state outlives an update.
+#[test]
+fn schedules_and_normalisers_resume() {
+    let dir = tempfile::tempdir().unwrap();
+    let [whole, parts] = ["whole", "parts"].map(|n| dir.path().join(n));
+    let options = [
+        "adam.schedule={ adaptive = { target_kl = 0.02 } }",
+        "ppo.reward_normalization=true",
+        "ppo.recompute_advantage=true",
+        "ppo.value_clip=true",
+        "ppo.dual_clip=2.0",
+        "ppo.target_kl=0.5",
+    ];
+    let sets: Vec<&str> = options.iter().flat_map(|s| ["--set", s]).collect();
+    run(4, &whole, &sets);
+    run(2, &parts, &sets);
+    let output = train(&["--resume", parts.to_str().unwrap(), "--set", "run.epochs=4"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    assert_same_run(&whole, &parts, "epoch-0004");
+    let rates = column(&whole, "loss/learning_rate");
+    assert!(rates.iter().any(|r| (r - 1e-3).abs() > 1e-6), "the step size adapts: {rates:?}");
+}
+
 #[test]
 fn damaged_checkpoints_are_refused() {
     let dir = tempfile::tempdir().unwrap();
@@ -118,13 +141,15 @@ fn bad_input_is_told_and_nothing_is_written() {
     let unknown = file("unknown.toml", &good.replace("[ppo]", "[ppo]\nclipp = 0.3"));
     let kind = file("kind.toml", &good.replace("lr = 1e-3", "lr = \"fast\""));
     let out = dir.path().join("run");
-    let cases: [(&[&str], &[&str]); 10] = [
+    let cases: [(&[&str], &[&str]); 12] = [
         (&["nothing"], &["'nothing'", "quick", ".toml"]),
         (&["absent.toml"], &["absent.toml"]),
         (&[unknown.to_str().unwrap()], &["unknown.toml", "clipp", "expected"]),
         (&[kind.to_str().unwrap()], &["kind.toml", "lr", "fast"]),
         (&["point", "--set", "ppo.clip=1.5"], &["ppo.clip", "1.5", "between 0 and 1"]),
         (&["point", "--set", "run.collect_steps=1000"], &["run.collect_steps", "1000", "multiple of run.envs"]),
+        (&["point", "--set", "ppo.dual_clip=0.5"], &["ppo.dual_clip", "0.5", "above 1"]),
+        (&["point", "--set", "adam.schedule={ adaptive = { target_kl = 0.0 } }"], &["adam.schedule.adaptive.target_kl", "0", "above 0"]),
         (&["point", "--set", "ppo.nonsense=1"], &["nonsense", "expected"]),
         (&["point", "--set", "env=moon"], &["moon", "point"]),
         (&["point", "--set", "checkpoint.best=glory"], &["checkpoint.best", "glory", "test_det/success"]),

@@ -5,7 +5,7 @@
 use egogen::DeviceChoice;
 use egogen::agent::{ObsGroup, ObsLayout, PolicyConfig, PolicySpec};
 use egogen::rng::stream;
-use egogen_train::{AdamConfig, AdamW, Compute, Learner, PpoConfig, Rollout, Shards};
+use egogen_train::{AdamConfig, AdamW, Compute, Learner, PpoConfig, Progress, Rollout, Rules, Shards};
 use rand_distr::{Distribution, StandardNormal};
 use std::time::Instant;
 
@@ -27,7 +27,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         _ => Compute::Own,
     };
     let adam = AdamW::new(params.len());
-    let mut learner = Learner::new(spec.clone(), compute, Shards::new(2, threads)?, params, adam, 0)?;
+    let mut learner = Learner::new(spec.clone(), compute, Shards::new(2, threads)?, params, adam, Progress::default())?;
     let ppo: PpoConfig = toml::from_str(
         "gamma = 0.99\nlambda = 0.95\nclip = 0.1\nvalue = 1.0\nentropy = 0.0\nkl_prior = 1.0\nmax_grad_norm = 0.1\npasses = 1\nbatch = 256",
     )?;
@@ -50,7 +50,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         rollout.terminated = vec![false; total];
         rollout.truncated = vec![false; total];
         rollout.obs = obs;
-        learner.update(&rollout, ENVS, &ppo, &config, 0)?;
+        learner.update(&rollout, &Rules { envs: ENVS, ppo: &ppo, adam: &config, seed: 0, updates: 4 })?;
         let all = start.elapsed().as_secs_f64();
         let ms = |s: f64| 1e3 * s / total as f64;
         println!("{:.3} ms/step acting, {:.3} ms/step learning: {:.0} steps/s", ms(acted), ms(all - acted), total as f64 / all);

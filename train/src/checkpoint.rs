@@ -4,6 +4,7 @@
 //! `model.safetensors`, `optimizer.safetensors`, `state.bin` (environments, counters, sums of a begun epoch) and
 //! `checkpoint.json`, which describes the policy and carries the hashes of the other files.
 
+use crate::ppo::Progress;
 use crate::stats::EpochStats;
 use crate::{AdamW, Error, Result};
 use egogen::agent::{ObsLayout, PolicyConfig, PolicySpec};
@@ -13,7 +14,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 const DESCRIPTION: &str = "checkpoint.json";
 const MODEL: &str = "model.safetensors";
 const OPTIMIZER: &str = "optimizer.safetensors";
@@ -60,12 +61,13 @@ pub struct Best {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct State {
     pub epoch: u64,
-    pub updates: u64,
     pub env_steps: u64,
     pub adam_steps: u64,
     pub best: Option<Best>,
     /// Figures of the last test.
     pub last_test: BTreeMap<String, f64>,
+    /// Updates done, and what schedules and normalisers have come to.
+    pub learning: Progress,
     /// Sums of the begun epoch.
     pub stats: EpochStats,
     /// What [`crate::Collector::save`] wrote.

@@ -30,6 +30,10 @@ pub struct Rollout {
     pub value: Vec<f32>,
     /// Value after the step (of the final observation where truncated); 0 where terminated.
     pub next_value: Vec<f32>,
+    /// Entries where the next entry of the same environment is not what the step led to: truncations and the last steps.
+    pub ends: Vec<usize>,
+    /// What those steps led to.
+    pub end_obs: Vec<f32>,
     pub reward: Vec<f32>,
     pub terminated: Vec<bool>,
     pub truncated: Vec<bool>,
@@ -37,6 +41,18 @@ pub struct Rollout {
     pub info: Vec<f64>,
     /// Episodes that ended.
     pub episodes: Vec<Episode>,
+}
+
+impl Rollout {
+    /// Value after each step, given `policy`'s value before each.
+    pub(crate) fn next_values(&self, envs: usize, value: &[f32], policy: &Policy) -> Result<Vec<f32>> {
+        let mut next = value[envs.min(value.len())..].to_vec();
+        next.resize(value.len(), 0.0);
+        let ends = policy.values(&self.end_obs)?;
+        self.ends.iter().zip(ends).for_each(|(&k, v)| next[k] = v);
+        next.iter_mut().zip(&self.terminated).filter(|(_, end)| **end).for_each(|(v, _)| *v = 0.0);
+        Ok(next)
+    }
 }
 
 /// The environments with their current observations and running episodes.
@@ -74,14 +90,9 @@ impl Collector {
     pub fn collect(&mut self, policy: &Policy, steps: usize) -> Result<Rollout> {
         let envs = self.env.num_envs();
         let mut out = Rollout { info: vec![0.0; self.env.spec().info.len()], ..Rollout::default() };
-        // Observations whose value the next step does not bring along: entry of the rollout and the observation.
-        let mut extra: (Vec<usize>, Vec<f32>) = Default::default();
         for t in 0..steps {
             let acts = policy.act(&self.obs)?;
             let first = out.reward.len();
-            if t > 0 {
-                out.next_value[first - envs..].copy_from_slice(&acts.value);
-            }
             self.record(&acts, &mut out);
             let actions = out.actions.len() - acts.mu.len()..;
             self.env.step(&out.actions[actions], &mut self.result)?;
@@ -91,19 +102,13 @@ impl Collector {
                 let cut = self.result.truncated[i] && !self.result.terminated[i];
                 let last = t + 1 == steps && !self.result.terminated[i];
                 if cut || last {
-                    extra.0.push(first + i);
-                    extra.1.extend_from_slice(&self.result.final_obs[i * width..(i + 1) * width]);
+                    out.ends.push(first + i);
+                    out.end_obs.extend_from_slice(&self.result.final_obs[i * width..(i + 1) * width]);
                 }
             }
             std::mem::swap(&mut self.obs, &mut self.result.obs);
         }
-        let values = policy.values(&extra.1)?;
-        extra.0.iter().zip(values).for_each(|(&k, v)| out.next_value[k] = v);
-        for (v, end) in out.next_value.iter_mut().zip(&out.terminated) {
-            if *end {
-                *v = 0.0;
-            }
-        }
+        out.next_value = out.next_values(envs, &out.value, policy)?;
         Ok(out)
     }
 
@@ -116,7 +121,6 @@ impl Collector {
         out.obs.extend_from_slice(&self.obs);
         out.actions.extend_from_slice(&actions);
         out.value.extend_from_slice(&acts.value);
-        out.next_value.resize(out.value.len(), 0.0);
     }
 
     fn take_result(&mut self, out: &mut Rollout) -> Result<()> {

@@ -49,6 +49,22 @@ mod tests {
         }
     }
 
+    /// Every pattern of terminations and truncations over four steps, by Tianshou's `compute_episodic_return`.
+    #[test]
+    fn agrees_with_tianshou() {
+        let t = crate::fixture();
+        let get = |name: &str| t.f32s(&format!("tianshou.gae.{name}"), &[4, 81]).unwrap();
+        let flags = |name: &str| -> Vec<bool> { get(name).iter().map(|&x| x != 0.0).collect() };
+        let (reward, value, next_value) = (get("reward"), get("value"), get("next_value"));
+        let (terminated, truncated) = (flags("terminated"), flags("truncated"));
+        let steps =
+            Steps { envs: 81, reward: &reward, value: &value, next_value: &next_value, terminated: &terminated, truncated: &truncated };
+        let (advantage, returns) = gae(&steps, 0.93, 0.8);
+        for (have, want) in advantage.iter().zip(get("advantage")).chain(returns.iter().zip(get("returns"))) {
+            assert!((have - want).abs() < 1e-5, "{have} against {want}");
+        }
+    }
+
     /// gamma 0.5, lambda 0.5, values 1 and 2, rewards 1 and 1; the last step ends the episode in three ways.
     #[test]
     fn by_hand() {

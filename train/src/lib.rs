@@ -17,6 +17,8 @@ pub mod primitives;
 pub mod program;
 pub mod recipe;
 pub mod registry;
+mod running;
+mod schedule;
 mod shards;
 pub mod stats;
 pub mod trainer;
@@ -28,7 +30,9 @@ pub use gae::{Steps, gae};
 pub use loss::{Batch, Losses, gradients};
 pub use optim::{AdamConfig, AdamW, clip_scale, global_norm};
 pub use policy::{Acts, Compute, Policy};
-pub use ppo::{Learner, PpoConfig, UpdateStats};
+pub use ppo::{Learner, PpoConfig, PriorForm, Progress, Rules, UpdateStats};
+pub use running::Running;
+pub use schedule::Schedule;
 pub use shards::Shards;
 
 /// Numbers from PyTorch and NumPy, made by tests/tools/ppo/make.py.

@@ -1,5 +1,6 @@
 //! Global gradient-norm clipping and AdamW over flat memory.
 
+use crate::schedule::Schedule;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -21,6 +22,9 @@ pub struct AdamConfig {
     /// Decoupled weight decay.
     #[serde(default = "weight_decay")]
     pub weight_decay: f32,
+    /// How the step size changes over the run.
+    #[serde(default)]
+    pub schedule: Schedule,
 }
 
 fn betas() -> [f32; 2] {
@@ -92,7 +96,7 @@ mod tests {
     #[test]
     fn agrees_with_torch() {
         let t = crate::fixture();
-        let config = AdamConfig { lr: 1e-2, betas: betas(), eps: eps(), weight_decay: weight_decay() };
+        let config = AdamConfig { lr: 1e-2, betas: betas(), eps: eps(), weight_decay: weight_decay(), schedule: Schedule::Constant };
         let mut params = t.f32s("adam.start", &[11]).unwrap();
         let mut adam = AdamW::new(11);
         let (grads, path) = (t.f32s("adam.grads", &[5, 11]).unwrap(), t.f32s("adam.path", &[5, 11]).unwrap());

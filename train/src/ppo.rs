@@ -5,12 +5,16 @@ use crate::gae::{Steps, gae};
 use crate::loss::{Batch, Losses, gradients};
 use crate::optim::{AdamConfig, AdamW, clip_scale, global_norm};
 use crate::policy::{Compute, Policy};
+use crate::running::Running;
 use crate::shards::Shards;
 use crate::{Error, Result};
 use egogen::agent::PolicySpec;
 use egogen::rng::stream;
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
+
+/// Added to the variance of returns, as Tianshou does.
+const EPS: f64 = 1e-8;
 
 /// Weights and ranges of the loss, and how a rollout is used.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -29,12 +33,51 @@ pub struct PpoConfig {
     /// Weight of the mean over dimensions of KL(policy || N(0, I)); keeps latents where the motion model knows them.
     #[serde(default)]
     pub kl_prior: f32,
+    /// What that penalty counts.
+    #[serde(default)]
+    pub kl_prior_form: PriorForm,
     /// Largest norm of all gradients together.
     pub max_grad_norm: f32,
-    /// Passes over each rollout.
+    /// Passes over each rollout (Tianshou: `repeat_per_collect`).
     pub passes: usize,
     /// Steps per gradient step.
     pub batch: usize,
+    /// Advantages are brought to mean 0 and standard deviation 1 in each minibatch.
+    #[serde(default = "on")]
+    pub advantage_normalization: bool,
+    /// For negative advantages A the policy's gain is at least this times A (Ye et al. 2020); above 1.
+    #[serde(default)]
+    pub dual_clip: Option<f32>,
+    /// The value counts as having moved by at most `clip` since collection wherever that makes its error larger.
+    #[serde(default)]
+    pub value_clip: bool,
+    /// Values, advantages and returns are computed again before each pass but the first.
+    #[serde(default)]
+    pub recompute_advantage: bool,
+    /// The critic learns returns divided by their running standard deviation.
+    #[serde(default)]
+    pub reward_normalization: bool,
+    /// The update ends before the gradient step whose minibatch has an `approx_kl` above 1.5 times this.
+    #[serde(default)]
+    pub target_kl: Option<f32>,
+    /// `clip` falls linearly to zero over the run.
+    #[serde(default)]
+    pub linear_clip: bool,
+}
+
+/// What the penalty `kl_prior` counts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PriorForm {
+    /// The whole divergence, KL(policy || N(0, I)).
+    #[default]
+    Full,
+    /// Its part from the means, mu^2 / 2, as in the authors' code (`weight_kld`).
+    Mean,
+}
+
+fn on() -> bool {
+    true
 }
 
 /// What an update leaves behind.
@@ -46,6 +89,43 @@ pub struct UpdateStats {
     pub explained_variance: f64,
     /// Largest |ratio - 1| in the first minibatch of the first pass, where the policy has not changed yet: rounding only.
     pub first_ratio_error: f64,
+    /// Step size at the end.
+    pub learning_rate: f64,
+    /// Gradient steps done.
+    pub gradient_steps: f64,
+}
+
+/// What stays the same for all updates of a run.
+#[derive(Clone, Copy, Debug)]
+pub struct Rules<'a> {
+    /// Environments of a rollout.
+    pub envs: usize,
+    /// The loss.
+    pub ppo: &'a PpoConfig,
+    /// The optimiser.
+    pub adam: &'a AdamConfig,
+    /// Seeds the shuffles, together with the number of the update.
+    pub seed: u64,
+    /// Updates of the whole run, after which linear schedules reach zero.
+    pub updates: u64,
+}
+
+/// What learning carries from update to update beside parameters and moments.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Progress {
+    /// Updates done.
+    pub updates: u64,
+    /// Step size that the last one ended with.
+    pub learning_rate: Option<f32>,
+    /// Returns so far, for `reward_normalization`.
+    pub returns: Running,
+}
+
+/// What the steps of a rollout are to teach; values and returns on the critic's scale.
+pub(crate) struct Targets {
+    pub value: Vec<f32>,
+    pub advantage: Vec<f32>,
+    pub returns: Vec<f32>,
 }
 
 /// Everything that learns: parameters, moments, and the policy that acts with the parameters.
@@ -56,14 +136,14 @@ pub struct Learner {
     policy: Policy,
     params: Vec<f32>,
     adam: AdamW,
-    updates: u64,
+    progress: Progress,
 }
 
 impl Learner {
-    /// A learner that starts from `params` and the state `adam`, after `updates` updates.
-    pub fn new(spec: PolicySpec, compute: Compute, shards: Shards, params: Vec<f32>, adam: AdamW, updates: u64) -> Result<Self> {
+    /// A learner that goes on from `params`, the moments `adam` and `progress`.
+    pub fn new(spec: PolicySpec, compute: Compute, shards: Shards, params: Vec<f32>, adam: AdamW, progress: Progress) -> Result<Self> {
         let policy = Policy::new(&spec, &params, &compute)?;
-        Ok(Self { spec, compute, shards, policy, params, adam, updates })
+        Ok(Self { spec, compute, shards, policy, params, adam, progress })
     }
 
     /// The policy as it is now.
@@ -81,9 +161,9 @@ impl Learner {
         &self.adam
     }
 
-    /// Updates done.
-    pub fn updates(&self) -> u64 {
-        self.updates
+    /// What the next update goes on from.
+    pub fn progress(&self) -> &Progress {
+        &self.progress
     }
 
     /// The policy's sizes.
@@ -91,55 +171,92 @@ impl Learner {
         &self.spec
     }
 
-    /// One update: advantages, then `passes` passes over shuffled minibatches. `seed` and the number of the update name the shuffles.
-    pub fn update(&mut self, rollout: &Rollout, envs: usize, ppo: &PpoConfig, adam: &AdamConfig, seed: u64) -> Result<UpdateStats> {
-        let (advantage, returns) = gae(&rollout.steps(envs), ppo.gamma, ppo.lambda);
-        let mut stats = UpdateStats { explained_variance: explained_variance(&returns, &rollout.value), ..Default::default() };
-        let mut order: Vec<usize> = (0..returns.len()).collect();
-        let mut rng = stream(seed, "minibatches", self.updates);
-        let batches = returns.len().div_ceil(ppo.batch) * ppo.passes;
-        for pass in 0..ppo.passes {
+    /// One update: advantages, then passes over shuffled minibatches.
+    pub fn update(&mut self, rollout: &Rollout, rules: &Rules) -> Result<UpdateStats> {
+        let done = (self.progress.updates as f64 / rules.updates.max(1) as f64).min(1.0) as f32;
+        let clip = if rules.ppo.linear_clip { rules.ppo.clip * (1.0 - done) } else { rules.ppo.clip };
+        let ppo = &PpoConfig { clip, ..*rules.ppo };
+        let mut lr = rules.adam.schedule.begin(rules.adam.lr, self.progress.learning_rate, done);
+        let mut targets = self.targets(rollout, rollout.value.clone(), &rollout.next_value, rules);
+        let mut stats = UpdateStats { explained_variance: explained_variance(&targets.returns, &targets.value), ..Default::default() };
+        let mut order: Vec<usize> = (0..targets.returns.len()).collect();
+        let mut rng = stream(rules.seed, "minibatches", self.progress.updates);
+        let (batches, mut steps) = (order.len().div_ceil(ppo.batch) * ppo.passes, 0);
+        'passes: for pass in 0..ppo.passes {
+            if pass > 0 && ppo.recompute_advantage {
+                targets = self.recompute(rollout, rules)?;
+            }
             order.shuffle(&mut rng);
-            for (i, chosen) in order.chunks(ppo.batch).enumerate() {
-                let batch = Batch::gather(rollout, &advantage, &returns, chosen);
-                let (losses, ratio_error) = self.step(&batch, ppo, adam)?;
-                stats.losses.add(&losses, 1.0 / batches as f64);
-                if pass == 0 && i == 0 {
+            for chosen in order.chunks(ppo.batch) {
+                let batch = Batch::gather(rollout, &targets, chosen);
+                let (grads, losses, ratio_error) = self.gradients(&batch, ppo)?;
+                if steps == 0 {
                     stats.first_ratio_error = ratio_error;
+                } else if ppo.target_kl.is_some_and(|kl| losses.approx_kl > 1.5 * f64::from(kl)) {
+                    break 'passes;
+                } else {
+                    lr = rules.adam.schedule.adapt(lr, losses.approx_kl);
                 }
+                stats.losses.add(&losses, 1.0 / batches as f64);
+                self.adam.step(
+                    &AdamConfig { lr, ..*rules.adam },
+                    &mut self.params,
+                    &grads,
+                    clip_scale(losses.grad_norm as f32, ppo.max_grad_norm),
+                );
+                steps += 1;
             }
         }
-        self.updates += 1;
+        if steps < batches {
+            stats.losses = stats.losses.scaled(batches as f64 / f64::from(steps as u32));
+        }
+        (stats.learning_rate, stats.gradient_steps) = (f64::from(lr), steps as f64);
+        self.progress.learning_rate = Some(lr);
+        self.progress.updates += 1;
         self.policy = Policy::new(&self.spec, &self.params, &self.compute)?;
         Ok(stats)
     }
 
-    /// One gradient step. Returns the losses and the largest |ratio - 1|.
-    fn step(&mut self, batch: &Batch, ppo: &PpoConfig, adam: &AdamConfig) -> Result<(Losses, f64)> {
+    /// Advantages and returns from values on the critic's scale; the returns then count towards its scale.
+    fn targets(&mut self, rollout: &Rollout, value: Vec<f32>, next_value: &[f32], rules: &Rules) -> Targets {
+        let scaled = rules.ppo.reward_normalization;
+        let scale = if scaled { (self.progress.returns.variance + EPS).sqrt() as f32 } else { 1.0 };
+        let times = |v: &[f32]| -> Vec<f32> { v.iter().map(|x| x * scale).collect() };
+        let steps = Steps {
+            envs: rules.envs,
+            reward: &rollout.reward,
+            value: &times(&value),
+            next_value: &times(next_value),
+            terminated: &rollout.terminated,
+            truncated: &rollout.truncated,
+        };
+        let (advantage, mut returns) = gae(&steps, rules.ppo.gamma, rules.ppo.lambda);
+        if scaled {
+            self.progress.returns.add(returns.iter().copied());
+            returns.iter_mut().for_each(|r| *r /= scale);
+        }
+        Targets { value, advantage, returns }
+    }
+
+    /// [`Learner::targets`] with the values of the current parameters.
+    fn recompute(&mut self, rollout: &Rollout, rules: &Rules) -> Result<Targets> {
+        let policy = Policy::new(&self.spec, &self.params, &self.compute)?;
+        let value = policy.values(&rollout.obs)?;
+        let next_value = rollout.next_values(rules.envs, &value, &policy)?;
+        Ok(self.targets(rollout, value, &next_value, rules))
+    }
+
+    /// Gradients and losses of a minibatch, all finite, and the largest |ratio - 1|.
+    fn gradients(&self, batch: &Batch, ppo: &PpoConfig) -> Result<(Vec<f32>, Losses, f64)> {
         let (grads, mut losses, ratio_error) = gradients(&self.spec, &self.params, &self.compute, &self.shards, batch, ppo)?;
-        let norm = global_norm(&grads);
-        losses.grad_norm = f64::from(norm);
-        if let Some((name, value)) = losses.named().iter().find(|(_, v)| !v.is_finite()) {
-            return Err(Error::run(format!(
+        losses.grad_norm = f64::from(global_norm(&grads));
+        match losses.named().iter().find(|(_, v)| !v.is_finite()) {
+            Some((name, value)) => Err(Error::run(format!(
                 "{name} became {value} in update {}: the run stops before it reaches the weights. A lower learning rate (adam.lr) or a \
                  tighter ppo.max_grad_norm may help; the last checkpoint is whole",
-                self.updates
-            )));
-        }
-        self.adam.step(adam, &mut self.params, &grads, clip_scale(norm, ppo.max_grad_norm));
-        Ok((losses, ratio_error))
-    }
-}
-
-impl Rollout {
-    fn steps(&self, envs: usize) -> Steps<'_> {
-        Steps {
-            envs,
-            reward: &self.reward,
-            value: &self.value,
-            next_value: &self.next_value,
-            terminated: &self.terminated,
-            truncated: &self.truncated,
+                self.progress.updates
+            ))),
+            None => Ok((grads, losses, ratio_error)),
         }
     }
 }
@@ -152,4 +269,112 @@ fn explained_variance(returns: &[f32], values: &[f32]) -> f64 {
     };
     let residual = variance(&mut returns.iter().zip(values).map(|(r, v)| f64::from(r - v)));
     1.0 - residual / variance(&mut returns.iter().map(|&r| f64::from(r))).max(1e-12)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Collector;
+    use egogen::agent::ObsLayout;
+    use egogen_envs::VecEnv;
+    use egogen_envs::point::PointGoal;
+
+    fn point(envs: usize) -> (Collector, Learner) {
+        let env = PointGoal::new(envs, 0);
+        let layout = ObsLayout::new(env.spec().obs.clone());
+        let spec = PolicySpec::new(serde_json::from_str(r#"{"trunk": 8, "blocks": 1}"#).unwrap(), layout, 2).unwrap();
+        let (params, adam) = (spec.init(1), AdamW::new(spec.params()));
+        let learner = Learner::new(spec, Compute::Own, Shards::new(1, 1).unwrap(), params, adam, Progress::default()).unwrap();
+        (Collector::new(Box::new(env), 3).unwrap(), learner)
+    }
+
+    fn config(changes: serde_json::Value) -> PpoConfig {
+        let mut config = serde_json::json!({
+            "gamma": 0.9, "lambda": 0.7, "clip": 0.2, "value": 0.5, "entropy": 0.0, "max_grad_norm": 1.0, "passes": 3, "batch": 64
+        });
+        config.as_object_mut().unwrap().extend(changes.as_object().unwrap().clone());
+        serde_json::from_value(config).unwrap()
+    }
+
+    fn adam(schedule: serde_json::Value) -> AdamConfig {
+        serde_json::from_value(serde_json::json!({"lr": 1e-2, "schedule": schedule})).unwrap()
+    }
+
+    /// Three collections with Tianshou's `reward_normalization`.
+    #[test]
+    fn returns_are_scaled_as_in_tianshou() {
+        let t = crate::fixture();
+        let (_, mut learner) = point(1);
+        let ppo = config(serde_json::json!({"reward_normalization": true}));
+        let rules = Rules { envs: 1, ppo: &ppo, adam: &adam("constant".into()), seed: 0, updates: 1 };
+        for c in 0..3 {
+            let get = |name: &str| t.f32s(&format!("tianshou.returns.{c}.{name}"), &[12]).unwrap();
+            let flags = |name: &str| -> Vec<bool> { get(name).iter().map(|&x| x != 0.0).collect() };
+            let (reward, terminated, truncated) = (get("reward"), flags("terminated"), flags("truncated"));
+            let rollout = Rollout { reward, terminated, truncated, ..Default::default() };
+            let targets = learner.targets(&rollout, get("value"), &get("next_value"), &rules);
+            let pairs = [(targets.advantage, get("advantage")), (targets.returns, get("returns"))];
+            for (have, want) in pairs.iter().flat_map(|(h, w)| h.iter().zip(w)) {
+                assert!((have - want).abs() < 1e-4 * want.abs().max(1.0), "collection {c}: {have} against {want}");
+            }
+        }
+    }
+
+    #[test]
+    fn recomputing_without_learning_changes_nothing() {
+        let (mut collector, mut learner) = point(8);
+        let rollout = collector.collect(learner.policy(), 45).unwrap();
+        assert!(rollout.truncated.contains(&true) && rollout.terminated.contains(&true));
+        let ppo = config(serde_json::json!({}));
+        let rules = Rules { envs: 8, ppo: &ppo, adam: &adam("constant".into()), seed: 0, updates: 1 };
+        let first = learner.targets(&rollout, rollout.value.clone(), &rollout.next_value, &rules);
+        let again = learner.recompute(&rollout, &rules).unwrap();
+        assert_eq!((first.value, first.advantage, first.returns), (again.value, again.advantage, again.returns));
+        // While learning it does.
+        let with = |recompute: bool| {
+            let (_, mut learner) = point(8);
+            let ppo = config(serde_json::json!({"recompute_advantage": recompute}));
+            learner.update(&rollout, &Rules { ppo: &ppo, ..rules }).unwrap();
+            learner.params().to_vec()
+        };
+        assert_ne!(with(true), with(false));
+    }
+
+    #[test]
+    fn a_large_divergence_ends_the_update() {
+        let steps = |target: serde_json::Value| {
+            let (mut collector, mut learner) = point(8);
+            let rollout = collector.collect(learner.policy(), 40).unwrap();
+            let ppo = config(serde_json::json!({"target_kl": target}));
+            let rules = Rules { envs: 8, ppo: &ppo, adam: &adam("constant".into()), seed: 0, updates: 1 };
+            learner.update(&rollout, &rules).unwrap()
+        };
+        // 320 steps in minibatches of 64, three passes.
+        assert_eq!(steps(serde_json::Value::Null).gradient_steps, 15.0);
+        let stopped = steps(1e-6.into());
+        assert_eq!(stopped.gradient_steps, 1.0);
+        // The one minibatch had the policy that collected: no divergence, and its mean is not diluted.
+        assert!(stopped.losses.approx_kl.abs() < 1e-9 && stopped.losses.grad_norm > 0.0);
+    }
+
+    #[test]
+    fn step_sizes_follow_the_schedule() {
+        let after = |schedule: serde_json::Value| {
+            let (mut collector, mut learner) = point(8);
+            let ppo = config(serde_json::json!({}));
+            let adam = adam(schedule);
+            let mut step = || {
+                let rollout = collector.collect(learner.policy(), 8).unwrap();
+                let rules = Rules { envs: 8, ppo: &ppo, adam: &adam, seed: 0, updates: 4 };
+                learner.update(&rollout, &rules).unwrap().learning_rate
+            };
+            [step(), step(), step()]
+        };
+        let close = |have: [f64; 3], want: [f64; 3]| assert!(have.iter().zip(want).all(|(h, w)| (h - w).abs() < 1e-8), "{have:?}");
+        close(after("constant".into()), [1e-2, 1e-2, 1e-2]);
+        close(after("linear".into()), [1e-2, 7.5e-3, 5e-3]);
+        // One minibatch a pass: two of three adapt, always upwards here, and the next update goes on from there.
+        let rising = serde_json::json!({"adaptive": {"target_kl": 1e3, "factor": 1.1, "max": 1.0}});
+        close(after(rising), [1e-2 * 1.21, 1e-2 * 1.21f64.powi(2), 1e-2 * 1.21f64.powi(3)]);
+    }
 }

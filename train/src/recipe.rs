@@ -1,6 +1,6 @@
 //! Recipes: what a person can train, as TOML; checked once into a [`Plan`].
 
-use crate::{AdamConfig, Error, PpoConfig, Result};
+use crate::{AdamConfig, Error, PpoConfig, Result, Schedule};
 use egogen::agent::PolicyConfig;
 use egogen::device::DeviceChoice;
 use serde::{Deserialize, Serialize};
@@ -171,6 +171,20 @@ impl Recipe {
         let weights = [("ppo.value", ppo.value), ("ppo.entropy", ppo.entropy), ("ppo.kl_prior", ppo.kl_prior)];
         for (key, value) in weights.into_iter().chain([("adam.weight_decay", adam.weight_decay)]) {
             self.expect(key, value, value >= 0.0 && value.is_finite(), "0 or more")?;
+        }
+        let above = |least: f32| move |v: f32| v > least && v.is_finite();
+        if let Some(value) = ppo.dual_clip {
+            self.expect("ppo.dual_clip", value, above(1.0)(value), "a number above 1")?;
+        }
+        if let Some(value) = ppo.target_kl {
+            self.expect("ppo.target_kl", value, above(0.0)(value), "a number above 0")?;
+        }
+        if let Schedule::Adaptive { target_kl, factor, min, max } = adam.schedule {
+            let key = |name: &str| format!("adam.schedule.adaptive.{name}");
+            self.expect(&key("target_kl"), target_kl, above(0.0)(target_kl), "a number above 0")?;
+            self.expect(&key("factor"), factor, above(1.0)(factor), "a number above 1")?;
+            self.expect(&key("min"), min, above(0.0)(min), "a number above 0")?;
+            self.expect(&key("max"), max, max >= min && max.is_finite(), &format!("at least min = {min}"))?;
         }
         for beta in adam.betas {
             self.expect("adam.betas", beta, (0.0..1.0).contains(&beta), "0 to below 1")?;

@@ -19,6 +19,8 @@ pub struct EpochStats {
     losses: Losses,
     explained_variance: f64,
     first_ratio_error: f64,
+    learning_rate: f64,
+    gradient_steps: f64,
 }
 
 /// Sums over finished episodes.
@@ -79,6 +81,8 @@ impl EpochStats {
         self.episodes.add(&rollout.episodes);
         self.losses.add(&update.losses, 1.0);
         self.explained_variance += update.explained_variance;
+        self.learning_rate += update.learning_rate;
+        self.gradient_steps += update.gradient_steps;
         self.first_ratio_error = self.first_ratio_error.max(update.first_ratio_error);
     }
 
@@ -90,7 +94,12 @@ impl EpochStats {
         row.extend(spec.info.iter().enumerate().map(|(i, n)| (format!("step/{n}"), self.info.get(i).copied().and_then(per_step))));
         let per_update = |sum: f64| (self.updates > 0).then(|| sum / self.updates as f64);
         row.extend(self.losses.named().into_iter().map(|(n, sum)| (format!("loss/{n}"), per_update(sum))));
-        row.push(("loss/explained_variance".into(), per_update(self.explained_variance)));
+        let figures = [
+            ("explained_variance", self.explained_variance),
+            ("learning_rate", self.learning_rate),
+            ("gradient_steps", self.gradient_steps),
+        ];
+        row.extend(figures.into_iter().map(|(n, sum)| (format!("loss/{n}"), per_update(sum))));
         row.push(("loss/first_ratio_error".into(), Some(self.first_ratio_error)));
         row
     }

@@ -4,7 +4,7 @@ use crate::checkpoint::{self, Best, Checkpoint, Description, State};
 use crate::collector::{Collector, test_episodes};
 use crate::logger::{Console, Csv, Logger, TensorBoard};
 use crate::policy::Compute;
-use crate::ppo::Learner;
+use crate::ppo::{Learner, Rules};
 use crate::recipe::Plan;
 use crate::registry::{Purpose, Registry};
 use crate::shards::Shards;
@@ -88,7 +88,7 @@ impl Trainer {
         let compute = Compute::new(recipe.device)?;
         let shards = Shards::new(recipe.run.shards, threads)?;
         Ok(Self {
-            learner: Learner::new(spec, compute, shards, params, adam, state.updates)?,
+            learner: Learner::new(spec, compute, shards, params, adam, state.learning)?,
             dir: dir.into(),
             origin: made.origin,
             env_spec,
@@ -107,7 +107,7 @@ impl Trainer {
     pub fn run(&mut self, stop: &AtomicBool) -> Result<Outcome> {
         let epochs = self.plan.recipe.run.epochs;
         let per_epoch = self.plan.updates_per_epoch;
-        let console = Console::new(epochs, epochs * per_epoch, self.learner.updates());
+        let console = Console::new(epochs, epochs * per_epoch, self.learner.progress().updates);
         let mut metrics: [Box<dyn Logger>; 2] =
             [Box::new(Csv::open(&self.dir.join("metrics.csv"), self.epoch)?), Box::new(TensorBoard::new(&self.dir.join("tensorboard")))];
         let mut timing = Csv::open(&self.dir.join("timing.csv"), self.epoch)?;
@@ -149,7 +149,9 @@ impl Trainer {
         let rollout = self.collector.collect(self.learner.policy(), self.plan.horizon)?;
         clock.collect += start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let update = self.learner.update(&rollout, recipe.run.envs, &recipe.ppo, &recipe.adam, recipe.seed)?;
+        let updates = recipe.run.epochs * self.plan.updates_per_epoch;
+        let rules = Rules { envs: recipe.run.envs, ppo: &recipe.ppo, adam: &recipe.adam, seed: recipe.seed, updates };
+        let update = self.learner.update(&rollout, &rules)?;
         clock.learn += start.elapsed().as_secs_f64();
         self.env_steps += rollout.reward.len() as u64;
         self.stats.add(&rollout, &update);
@@ -159,7 +161,8 @@ impl Trainer {
     /// Counts the epoch, tests where it is due, and gives its figures.
     fn finish_epoch(&mut self, clock: &mut Clock) -> Result<Row> {
         self.epoch += 1;
-        let mut row: Row = vec![("updates".into(), Some(self.learner.updates() as f64)), ("env_steps".into(), Some(self.env_steps as f64))];
+        let mut row: Row =
+            vec![("updates".into(), Some(self.learner.progress().updates as f64)), ("env_steps".into(), Some(self.env_steps as f64))];
         row.extend(std::mem::take(&mut self.stats).row(&self.env_spec));
         let test = &self.plan.recipe.test;
         let due = self.epoch.is_multiple_of(test.every) || self.epoch == self.plan.recipe.run.epochs;
@@ -210,11 +213,11 @@ impl Trainer {
             adam: self.learner.adam().clone(),
             state: State {
                 epoch: self.epoch,
-                updates: self.learner.updates(),
                 env_steps: self.env_steps,
                 adam_steps: self.learner.adam().steps,
                 best: self.best.clone(),
                 last_test: self.last_test.clone(),
+                learning: *self.learner.progress(),
                 stats: self.stats.clone(),
                 collector: self.collector.save()?,
             },

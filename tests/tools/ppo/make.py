@@ -1,4 +1,4 @@
-"""Numbers for the PPO tests, from NumPy and PyTorch alone. Writes ../../fixtures/ppo.safetensors.
+"""Numbers for the PPO tests, from NumPy, PyTorch and Tianshou. Writes ../../fixtures/ppo.safetensors.
 
     python -m venv venv && venv/bin/pip install -r requirements.txt && venv/bin/python make.py
 """
@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from safetensors.numpy import save_file
+from tianshou.data import Batch, ReplayBuffer
+from tianshou.policy import BasePolicy, PPOPolicy
 from torch.distributions import Independent, Normal, kl_divergence
 
 OUT = {}
@@ -87,7 +89,12 @@ def loss(name, trunk, rows=13, clip=0.2, c1=0.7, c2=0.05, w=0.4):
     vf = (ret - value).pow(2).mean()
     entropy = pi.entropy().mean()
     prior = kl_divergence(Normal(mu, (logvar / 2).exp()), Normal(torch.zeros_like(mu), torch.ones_like(mu))).mean()
-    (policy + c1 * vf - c2 * entropy + w * prior).backward()
+    (policy + c1 * vf - c2 * entropy + w * prior).backward(retain_graph=True)
+    if trunk is None:
+        # The penalty on the means alone.
+        mean_only = policy + c1 * vf - c2 * entropy + w * 0.5 * mu.pow(2).mean()
+        for (key, _), g in zip(net.named_parameters(), torch.autograd.grad(mean_only, net.parameters())):
+            put(f"{name}.grad_mean/{key}", g)
     for key, p in net.named_parameters():
         put(f"{name}.param/{key}", p)
         put(f"{name}.grad/{key}", p.grad)
@@ -98,6 +105,7 @@ def loss(name, trunk, rows=13, clip=0.2, c1=0.7, c2=0.05, w=0.4):
         put(f"{name}.{key}", v)
     clamped = (logvar.abs() == 0.15).float().mean().item()
     assert 0.05 < clamped < 0.95 and 0 < fraction < 1, "the case does not reach every branch"
+    return net
 
 
 def adam(count=11, steps=5):
@@ -116,8 +124,110 @@ def adam(count=11, steps=5):
     put("adam.path", torch.stack(path))
 
 
+def buffer_of(terminated, truncated, obs, after, reward):
+    """One environment's steps in Tianshou's buffer, and the batch of all of them."""
+    buffer = ReplayBuffer(len(reward))
+    for t in range(len(reward)):
+        step = dict(obs=obs[t], act=0, rew=reward[t], terminated=terminated[t], truncated=truncated[t], obs_next=after[t], info={})
+        buffer.add(Batch(**step))
+    return buffer, *buffer.sample(0)
+
+
+def tianshou_gae(steps=4, gamma=0.93, lam=0.8):
+    """Tianshou's own advantages for every pattern of nothing, a termination and a truncation over the steps: an environment each."""
+    envs = 3**steps
+    ends = np.arange(envs)[None] // 3 ** np.arange(steps)[:, None] % 3
+    terminated, truncated = ends == 1, ends == 2
+    reward, value, after = rng.normal(size=(3, steps, envs))
+    adv, ret = np.zeros((2, steps, envs))
+    for i in range(envs):
+        buffer, batch, indices = buffer_of(terminated[:, i], truncated[:, i], value[:, i], after[:, i], reward[:, i])
+        returns, advantage = BasePolicy.compute_episodic_return(
+            batch, buffer, indices, after[:, i], value[:, i], gamma=gamma, gae_lambda=lam
+        )
+        adv[:, i], ret[:, i] = advantage, returns
+    named = dict(reward=reward, value=value, next_value=after, terminated=terminated, truncated=truncated, advantage=adv, returns=ret)
+    for name, v in named.items():
+        put(f"tianshou.gae.{name}", v)
+
+
+class Identity(torch.nn.Module):
+    """A critic whose value is the observation, so that values can be chosen."""
+
+    def forward(self, obs, **_):
+        return torch.as_tensor(obs, dtype=torch.float32)
+
+
+def ppo_policy(actor, critic, dist, **options):
+    params = [p for p in actor.parameters()] or [torch.nn.Parameter(torch.zeros(1))]
+    return PPOPolicy(actor, critic, torch.optim.SGD(params, lr=0.0), dist, **options)
+
+
+def tianshou_returns(steps=12, collections=3, gamma=0.9, lam=0.7):
+    """Returns and advantages with Tianshou's reward_normalization over consecutive collections of one environment."""
+    options = dict(discount_factor=gamma, gae_lambda=lam, reward_normalization=True)
+    policy = ppo_policy(Identity(), Identity(), None, **options)
+    for c in range(collections):
+        reward = 4 * rng.normal(size=steps) + 1
+        value, after = rng.normal(size=(2, steps)).astype(np.float32)
+        end = rng.random(steps)
+        terminated, truncated = end < 0.15, (end >= 0.15) & (end < 0.3)
+        buffer, batch, indices = buffer_of(terminated, truncated, value, after, reward)
+        batch = policy._compute_returns(batch, buffer, indices)
+        named = dict(reward=reward, value=value, next_value=after, terminated=terminated, truncated=truncated)
+        for name, v in (named | dict(advantage=batch.adv, returns=batch.returns)).items():
+            put(f"tianshou.returns.{c}.{name}", v)
+
+
+class Half(torch.nn.Module):
+    """Actor or critic of a network, as Tianshou calls them."""
+
+    def __init__(self, net, part):
+        super().__init__()
+        self.net, self.part = net, part
+
+    def forward(self, obs, state=None, info=None):
+        return self.part(self.net, obs) if state is None and info is None else (self.part(self.net, obs), state)
+
+
+def tianshou_learn(name, net, actor, critic, dist, obs, action, variants, noise=0.9):
+    """Losses and gradients of one minibatch through PPOPolicy.learn. `actor` gives the arguments of `dist`."""
+    rows = len(obs)
+    with torch.no_grad():
+        pi = dist(*actor(net, obs))
+        old = pi.log_prob(action) + noise * torch.randn(rows)
+        old_value = critic(net, obs) + 0.4 * torch.randn(rows)
+    adv, ret = torch.randn(rows) * 3 + 1, torch.randn(rows)
+    for key, v in dict(obs=obs, action=action, old=old, old_value=old_value, advantage=adv, returns=ret).items():
+        put(f"{name}.{key}", v)
+    figures = {}
+    for variant, options in variants.items():
+        policy = ppo_policy(Half(net, actor), Half(net, critic), dist, vf_coef=0.7, ent_coef=0.05, max_grad_norm=None, eps_clip=0.2, **options)
+        batch = Batch(obs=obs, act=action, logp_old=old, adv=adv.clone(), returns=ret, v_s=old_value, info=torch.zeros(rows))
+        losses = policy.learn(batch, batch_size=rows, repeat=1)
+        for key, p in net.named_parameters():
+            put(f"{name}.{variant}/{key}", p.grad)
+        figures[variant] = np.array([losses["loss/clip"][0], losses["loss/vf"][0], losses["loss/ent"][0]])
+        put(f"{name}.figures.{variant}", figures[variant])
+    for variant, f in figures.items():
+        assert variant == "plain" or not np.allclose(f[:2], figures["plain"][:2], rtol=1e-3), f"{variant} changes nothing"
+
+
+VARIANTS = {
+    "plain": {},
+    "dual": dict(dual_clip=1.3),
+    "value": dict(value_clip=True),
+    "raw": dict(dual_clip=1.3, value_clip=True, advantage_normalization=False),
+}
+gaussian = lambda mu, sigma: Independent(Normal(mu, sigma), 1)
+
 gae()
-loss("sum", None)
+paper = loss("sum", None)
 loss("project", 10)
 adam()
+tianshou_gae()
+tianshou_returns()
+std = lambda net, obs: (net(obs)[0], (net(obs)[1] / 2).exp())
+value = lambda net, obs: net(obs)[2]
+tianshou_learn("paper", paper, std, value, gaussian, torch.randn(13, 30), torch.randn(13, 4), VARIANTS)
 save_file(OUT, Path(__file__).parents[2] / "fixtures" / "ppo.safetensors")

@@ -19,6 +19,10 @@ fn policy() -> PolicySpec {
         octaves: 12,
         trunk: None,
         blocks: 2,
+        hidden: vec![],
+        activation: Default::default(),
+        shared: false,
+        log_std: None,
         logvar: [-2.5, 2.5],
         actor_scale: Default::default(),
     };
@@ -29,11 +33,12 @@ fn policy() -> PolicySpec {
 fn outputs_and_gradient(spec: &PolicySpec, flat: &[f32], obs: &[f32], device: Device) -> (Vec<f32>, Vec<f32>) {
     let network = Network::new(spec, flat, &device.autodiff());
     let out = network.forward(obs);
+    let logvar = out.logvar.expect("the actions are continuous");
     let mut all = Vec::new();
-    for part in [out.mu.clone().into_data(), out.logvar.clone().into_data(), out.value.clone().into_data()] {
+    for part in [out.mu.clone().into_data(), logvar.clone().into_data(), out.value.clone().into_data()] {
         all.extend_from_slice(part.as_slice::<f32>().expect("outputs are f32"));
     }
-    let loss = out.mu.powf_scalar(2.0).mean() + out.logvar.exp().mean() + (out.value - 1.0).powf_scalar(2.0).mean();
+    let loss = out.mu.powf_scalar(2.0).mean() + logvar.exp().mean() + (out.value - 1.0).powf_scalar(2.0).mean();
     let mut gradient = vec![0.0; spec.params()];
     network.add_gradients(&mut loss.backward(), &mut gradient);
     (all, gradient)

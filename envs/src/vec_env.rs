@@ -1,25 +1,6 @@
 //! The contract between an environment and a trainer.
 
-pub use egogen::agent::ObsGroup;
-
-/// What an action is.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum ActionSpace {
-    /// A vector of that many unbounded floats.
-    Continuous(usize),
-    /// One of that many choices, given as a float holding the index.
-    Discrete(usize),
-}
-
-impl ActionSpace {
-    /// Floats per action in a step's batch.
-    pub fn width(&self) -> usize {
-        match self {
-            Self::Continuous(n) => *n,
-            Self::Discrete(_) => 1,
-        }
-    }
-}
+pub use egogen::agent::{ActionSpace, ObsGroup};
 
 /// Shapes and names that stay fixed for the life of an environment.
 #[derive(Clone, Debug, PartialEq, Eq)]

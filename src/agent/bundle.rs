@@ -3,7 +3,7 @@
 //! The JSON names the observation layout, the sizes, the log-variance clamp, the hashes of what the policy stands on (motion model,
 //! body) and a golden pair: outputs for a fixed input, computed again whenever the bundle is read.
 
-use super::{Network, ObsLayout, PolicyConfig, PolicySpec};
+use super::{ActionSpace, Network, ObsLayout, PolicyConfig, PolicySpec};
 use crate::io::{Precision, Tensors, pack_tensors, write_atomic};
 use crate::rng::stream;
 use crate::{Error, Result};
@@ -41,7 +41,7 @@ struct Description {
     format: u32,
     layout: ObsLayout,
     policy: PolicyConfig,
-    action: usize,
+    action: ActionSpace,
     origin: BTreeMap<String, String>,
     trained: Trained,
     /// Content hash of the weights' file.
@@ -137,7 +137,7 @@ impl Bundle {
         let rows = GOLDEN * self.spec.layout.dim();
         let obs: Vec<f32> = StandardNormal.sample_iter(stream(0, "golden observations", 0)).take(rows).collect();
         let out = self.network(&Device::flex()).forward(&obs);
-        Golden { mu: floats(out.mu), logvar: floats(out.logvar), value: floats(out.value) }
+        Golden { mu: floats(out.mu), logvar: out.logvar.map(floats).unwrap_or_default(), value: floats(out.value) }
     }
 
     fn check_golden(&self, path: &Path, want: &Golden) -> Result<()> {

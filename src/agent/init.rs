@@ -1,6 +1,6 @@
 //! Initial weights.
 
-use super::spec::{ActorScale, Dense, Part, PolicySpec};
+use super::{ActorScale, Dense, Part, PolicySpec};
 use crate::rng::{Stream, stream};
 use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
@@ -28,6 +28,7 @@ impl PolicySpec {
                 None => orthogonal(layer, std::f32::consts::SQRT_2 * self.scale(i), &mut rng, block),
             }
         }
+        flat[self.log_std_range()].fill(self.config.log_std.unwrap_or(0.0));
         flat
     }
 
@@ -83,6 +84,48 @@ fn dot(a: &[f32], b: &[f32]) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    use crate::agent::{ObsGroup, ObsLayout};
+    use crate::io::Tensors;
+
+    /// Moments of many draws against those of torch's `orthogonal_`, within a few of their own standard errors.
+    #[test]
+    fn weights_are_spread_as_torchs() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures/ppo.safetensors");
+        let want = Tensors::read(path).unwrap().f32s("orthogonal.moments", &[4]).unwrap();
+        let layer = Dense { weight: String::new(), bias: String::new(), input: 9, output: 6, offset: 0 };
+        let (mut sums, draws, mut w) = ([0.0f64; 4], 4000, vec![0.0; 54]);
+        for seed in 0..draws {
+            orthogonal(&layer, std::f32::consts::SQRT_2, &mut stream(seed, "test", 0), &mut w);
+            for (i, x) in w.iter().map(|&x| f64::from(x)).enumerate() {
+                let diagonal = if i % 10 == 0 { 9.0 * x } else { 0.0 };
+                [x, x * x, x.powi(4), diagonal].iter().zip(&mut sums).for_each(|(x, s)| *s += x / (54 * draws) as f64);
+            }
+        }
+        for ((have, want), near) in sums.iter().zip(want).zip([0.005, 1e-4, 0.003, 0.015]) {
+            assert!((have - f64::from(want)).abs() < near, "{sums:?}");
+        }
+    }
+
+    #[test]
+    fn layers_start_orthogonal() {
+        let layout = ObsLayout::new(vec![ObsGroup { name: "state".into(), shape: vec![5] }]);
+        let config = serde_json::json!({"hidden": [12, 7], "log_std": -0.5});
+        let spec = PolicySpec::new(serde_json::from_value(config).unwrap(), layout, 3).unwrap();
+        let flat = spec.init(3);
+        for (i, layer) in spec.layers.iter().enumerate() {
+            let (w, rows) = (layer.weight_of(&flat), layer.output);
+            let gain = if spec.actor.last() == Some(&i) { 2e-4 } else { 2.0 };
+            let at = |r: usize, c: usize| if rows <= layer.input { w[r * layer.input + c] } else { w[c * layer.input + r] };
+            let (few, many) = (rows.min(layer.input), rows.max(layer.input));
+            for (r, s) in (0..few).flat_map(|r| (0..few).map(move |s| (r, s))) {
+                let dot: f32 = (0..many).map(|c| at(r, c) * at(s, c)).sum();
+                assert!((dot / gain - f32::from(r == s)).abs() < 1e-5, "{}: rows {r} and {s}", layer.weight);
+            }
+            assert!(layer.bias_of(&flat).iter().all(|&b| b == 0.0));
+        }
+        assert_eq!(flat[spec.log_std_range()], [-0.5; 3]);
+    }
 
     #[test]
     fn vectors_are_orthonormal() {

@@ -1,11 +1,17 @@
 //! How a policy sees and acts: observation layout, network, action distribution.
 
+mod action;
 pub mod bundle;
+mod categorical;
+mod config;
 mod gaussian;
 mod init;
 mod network;
 mod spec;
 
+pub use action::ActionSpace;
+pub use categorical::{categorical, choice_at, likeliest, log_softmax_of};
+pub use config::{ActorScale, LAYOUT_VERSION, Nonlinearity, ObsGroup, ObsLayout, PolicyConfig};
 pub use gaussian::{entropy, kl_to_prior, log_prob, log_prob_of};
 pub use network::{Network, Output, SLOPE};
-pub use spec::{ActorScale, Dense, Encoder, LAYOUT_VERSION, ObsGroup, ObsLayout, Part, PolicyConfig, PolicySpec};
+pub use spec::{Dense, Encoder, Part, PolicySpec};

@@ -3,7 +3,7 @@
 //! Parameters live in one flat vector outside (see [`PolicySpec`]): the optimiser, the gradient norm and files work on that, and a
 //! [`Network`] is built from it for each update.
 
-use super::spec::{Dense, Part, PolicySpec};
+use super::{ActionSpace, Dense, Nonlinearity, Part, PolicySpec};
 use burn::tensor::activation::{relu, sigmoid, tanh};
 use burn::tensor::module::linear;
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
@@ -13,10 +13,10 @@ pub const SLOPE: f32 = 0.01;
 
 /// What the network says about n observations.
 pub struct Output {
-    /// (n, A) mean of the actions.
+    /// (n, A) mean of the actions, or (n, K) logits of discrete ones.
     pub mu: Tensor<2>,
-    /// (n, A) clamped log variance.
-    pub logvar: Tensor<2>,
+    /// (n, A) clamped log variance; none for discrete actions.
+    pub logvar: Option<Tensor<2>>,
     /// (n) value.
     pub value: Tensor<1>,
 }
@@ -30,6 +30,8 @@ struct Layer {
 pub struct Network {
     spec: PolicySpec,
     layers: Vec<Layer>,
+    /// (1, A)
+    log_std: Option<Tensor<2>>,
     device: Device,
 }
 
@@ -45,14 +47,21 @@ impl Network {
             weight: Tensor::from_data(TensorData::new(d.weight_of(flat).to_vec(), [d.output, d.input]), &inner),
             bias: Tensor::from_data(TensorData::new(d.bias_of(flat).to_vec(), [d.output]), &inner),
         };
-        let network = Self { spec: spec.clone(), layers: spec.layers.iter().map(layer).collect(), device: inner };
+        let log_std = || Tensor::from_data(TensorData::new(flat[spec.log_std_range()].to_vec(), [1, spec.action.count()]), &inner);
+        let log_std = spec.log_std.map(|_| log_std());
+        let network = Self { spec: spec.clone(), layers: spec.layers.iter().map(layer).collect(), log_std, device: inner };
         if device.is_autodiff() { network.with_gradients() } else { network }
     }
 
     /// The same weights as leaves of a gradient graph of their own.
     pub fn with_gradients(&self) -> Self {
         let leaf = |l: &Layer| Layer { weight: l.weight.clone().autodiff().require_grad(), bias: l.bias.clone().autodiff().require_grad() };
-        Self { spec: self.spec.clone(), layers: self.layers.iter().map(leaf).collect(), device: self.device.clone().autodiff() }
+        Self {
+            spec: self.spec.clone(),
+            layers: self.layers.iter().map(leaf).collect(),
+            log_std: self.log_std.clone().map(|s| s.autodiff().require_grad()),
+            device: self.device.clone().autodiff(),
+        }
     }
 
     /// The policy's sizes.
@@ -69,13 +78,17 @@ impl Network {
     pub fn forward(&self, obs: &[f32]) -> Output {
         let trunk = self.trunk(obs);
         let out = self.head(&self.spec.actor, trunk.clone());
+        let value = self.head(&self.spec.critic, trunk).squeeze_dim(1);
         let [low, high] = self.spec.config.logvar;
-        let width = self.spec.action;
-        Output {
-            mu: out.clone().narrow(1, 0, width),
-            logvar: out.narrow(1, width, width).clamp(low, high),
-            value: self.head(&self.spec.critic, trunk).squeeze_dim(1),
-        }
+        let ActionSpace::Continuous(width) = self.spec.action else { return Output { mu: out, logvar: None, value } };
+        let (mu, logvar) = match &self.log_std {
+            Some(log_std) => {
+                let rows = out.dims()[0];
+                (out, log_std.clone().repeat_dim(0, rows) * 2.0)
+            }
+            None => (out.clone().narrow(1, 0, width), out.narrow(1, width, width)),
+        };
+        Output { mu, logvar: Some(logvar.clamp(low, high)), value }
     }
 
     /// Values only, (n).
@@ -95,6 +108,10 @@ impl Network {
                 let values = data.as_slice::<f32>().expect("gradients are f32");
                 flat[at..at + values.len()].iter_mut().zip(values).for_each(|(f, g)| *f += g);
             }
+        }
+        if let Some(data) = self.log_std.as_ref().and_then(|s| s.grad_remove(grads)).map(Tensor::into_data) {
+            let values = data.as_slice::<f32>().expect("gradients are f32");
+            flat[self.spec.log_std_range()].iter_mut().zip(values).for_each(|(f, g)| *f += g);
         }
     }
 
@@ -121,10 +138,22 @@ impl Network {
             });
         }
         let joined = Tensor::cat(parts, 1);
-        match self.spec.project {
+        let trunk = match self.spec.project {
             Some(i) => self.apply(i, joined),
             None => joined,
+        };
+        self.plain(&self.spec.shared, trunk)
+    }
+
+    fn plain(&self, layers: &[usize], mut h: Tensor<2>) -> Tensor<2> {
+        for &layer in layers {
+            h = self.apply(layer, h);
+            h = match self.spec.config.activation {
+                Nonlinearity::Tanh => tanh(h),
+                Nonlinearity::Relu => relu(h),
+            };
         }
+        h
     }
 
     fn tensor(&self, data: Vec<f32>, rows: usize) -> Tensor<2> {
@@ -158,6 +187,9 @@ impl Network {
 
     fn head(&self, layers: &[usize], mut h: Tensor<2>) -> Tensor<2> {
         let (output, blocks) = layers.split_last().expect("a head has an output layer");
+        if !self.spec.config.hidden.is_empty() {
+            return self.apply(*output, self.plain(blocks, h));
+        }
         for block in blocks.chunks_exact(2) {
             let inner = leaky(self.apply(block[0], h.clone()));
             h = leaky(self.apply(block[1], inner)) + h;

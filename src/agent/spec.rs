@@ -5,112 +5,26 @@
 //! | `encoder.<group>.weight_ih_l0`, `bias_ih_l0` | (3H, F), (3H) | GRU over a sequence group, gates in the order r, z, n |
 //! | `encoder.<group>.weight_hh_l0`, `bias_hh_l0` | (3H, H), (3H) | |
 //! | `project.weight`, `project.bias` | (trunk, E), (trunk) | only with [`PolicyConfig::trunk`] |
+//! | `shared.<i>.weight`, `.bias` | (W', W), (W') | plain layers before both heads, with [`PolicyConfig::shared`] |
 //! | `actor.<b>.<0 or 1>.weight`, `.bias` | (W, W), (W) | h = block(h) + h, block = two leaky ReLU layers |
+//! | `actor.<i>.weight`, `.bias` | (W', W), (W') | plain layers instead, with [`PolicyConfig::hidden`] |
 //! | `actor.out.weight`, `.bias` | (2A, W), (2A) | mean, then log variance before the clamp |
-//! | `critic.<b>.<0 or 1>`, `critic.out` | (W, W), (1, W) | |
+//! | | (A, W), (A) | the mean alone, with [`PolicyConfig::log_std`] |
+//! | | (K, W), (K) | logits of K discrete actions |
+//! | `critic.<b>.<0 or 1>` or `critic.<i>`, `critic.out` | (W, W), (1, W) | |
+//! | `actor.log_std` | (A) | log standard deviation before the clamp, with [`PolicyConfig::log_std`] |
 //!
 //! Layouts are torch's: `weight` is (out, in) row-major, y = W x + b.
 
+use super::config::check;
+use super::{ActionSpace, ObsGroup, ObsLayout, PolicyConfig};
 use crate::io::Tensors;
 use crate::{Error, Result};
-use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
 
-/// Version of the rules by which observations become network inputs.
-pub const LAYOUT_VERSION: u32 = 1;
 /// Scalar groups are encoded; this is their width.
 const SCALAR: usize = 1;
-
-/// One named part of an observation.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ObsGroup {
-    /// Field name, e.g. "egosensing".
-    pub name: String,
-    /// Shape for one person: \[frames, floats\] is a sequence, \[1\] an encoded scalar, \[n\] a plain vector.
-    pub shape: Vec<usize>,
-}
-
-impl ObsGroup {
-    /// Floats of the group.
-    pub fn len(&self) -> usize {
-        self.shape.iter().product()
-    }
-
-    /// Whether the group holds no floats.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-}
-
-/// The groups in the order in which they lie in an observation row.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct ObsLayout {
-    /// [`LAYOUT_VERSION`] at the time of training.
-    pub version: u32,
-    /// The groups.
-    pub groups: Vec<ObsGroup>,
-}
-
-impl ObsLayout {
-    /// A layout of the current version.
-    pub fn new(groups: Vec<ObsGroup>) -> Self {
-        Self { version: LAYOUT_VERSION, groups }
-    }
-
-    /// Floats of one observation row.
-    pub fn dim(&self) -> usize {
-        self.groups.iter().map(ObsGroup::len).sum()
-    }
-}
-
-/// Which actor layers start 100 times smaller.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ActorScale {
-    /// The last one, as in the paper's text.
-    #[default]
-    Last,
-    /// Every one, as in the authors' code.
-    Code,
-}
-
-/// Sizes of the policy network, as a recipe gives them.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PolicyConfig {
-    /// Hidden width of the GRU over each sequence group, by group name.
-    #[serde(default)]
-    pub gru: BTreeMap<String, usize>,
-    /// Scalars x become sin(2^k x), cos(2^k x) for k below this.
-    #[serde(default = "default_octaves")]
-    pub octaves: usize,
-    /// Width of the trunk behind a linear projection of the encodings; absent: their concatenation is the trunk.
-    #[serde(default)]
-    pub trunk: Option<usize>,
-    /// Residual blocks of actor and critic each.
-    #[serde(default = "default_blocks")]
-    pub blocks: usize,
-    /// Range to which the log variance of actions is clamped.
-    #[serde(default = "default_logvar")]
-    pub logvar: [f32; 2],
-    /// Which actor layers start 100 times smaller.
-    #[serde(default)]
-    pub actor_scale: ActorScale,
-}
-
-fn default_octaves() -> usize {
-    12
-}
-
-fn default_blocks() -> usize {
-    2
-}
-
-fn default_logvar() -> [f32; 2] {
-    [-2.5, 2.5]
-}
+/// Tensor name of [`PolicySpec::log_std`].
+const LOG_STD: &str = "actor.log_std";
 
 /// Where a layer's weights lie in the flat parameter vector; the bias follows the weight.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -168,25 +82,32 @@ pub struct Encoder {
 pub struct PolicySpec {
     pub config: PolicyConfig,
     pub layout: ObsLayout,
-    /// Floats of an action.
-    pub action: usize,
+    /// What an action is.
+    pub action: ActionSpace,
     /// Encoders in the order of the groups, which is the order of the concatenation.
     pub encoders: Vec<Encoder>,
     /// All layers, in the order of the flat vector.
     pub layers: Vec<Dense>,
     /// Index of the projection in `layers`.
     pub project: Option<usize>,
-    /// Indices of the actor's layers: two per block, then the output.
+    /// Indices of the plain layers before both heads.
+    pub shared: Vec<usize>,
+    /// Indices of the actor's layers: two per block or the plain ones, then the output.
     pub actor: Vec<usize>,
     /// Indices of the critic's layers.
     pub critic: Vec<usize>,
+    /// First float of the log standard deviation that is a parameter.
+    pub log_std: Option<usize>,
 }
 
 impl PolicySpec {
-    /// Checks the sizes and lays out all layers. `action` is the number of floats of an action.
-    pub fn new(config: PolicyConfig, layout: ObsLayout, action: usize) -> Result<Self> {
+    /// Checks the sizes and lays out all layers. A number as `action` is the floats of a continuous one.
+    pub fn new(config: PolicyConfig, layout: ObsLayout, action: impl Into<ActionSpace>) -> Result<Self> {
+        let action = action.into();
         check(&config, &layout, action)?;
-        let mut spec = Self { config, layout, action, encoders: vec![], layers: vec![], project: None, actor: vec![], critic: vec![] };
+        let (encoders, layers, project, log_std) = (vec![], vec![], None, None);
+        let (shared, actor, critic) = (vec![], vec![], vec![]);
+        let mut spec = Self { config, layout, action, encoders, layers, project, shared, actor, critic, log_std };
         let mut start = 0;
         for group in spec.layout.groups.clone() {
             let encoder = spec.encoder(&group, start);
@@ -194,18 +115,41 @@ impl PolicySpec {
             spec.encoders.push(encoder);
         }
         let encoded = spec.encoders.iter().map(|e| e.output).sum();
-        let trunk = spec.config.trunk.unwrap_or(encoded);
+        let mut trunk = spec.config.trunk.unwrap_or(encoded);
         if spec.config.trunk.is_some() {
             spec.project = Some(spec.dense("project", encoded, trunk));
         }
-        spec.actor = spec.head("actor", trunk, 2 * action);
+        if spec.config.shared {
+            (spec.shared, trunk) = spec.plain("shared", trunk);
+        }
+        spec.actor = spec.head("actor", trunk, spec.outputs());
         spec.critic = spec.head("critic", trunk, 1);
+        spec.log_std = spec.config.log_std.map(|_| spec.params());
         Ok(spec)
+    }
+
+    /// Floats the actor gives: means and log variances, means alone, or logits.
+    pub fn outputs(&self) -> usize {
+        match self.action {
+            ActionSpace::Continuous(n) if self.config.log_std.is_none() => 2 * n,
+            _ => self.action.count(),
+        }
+    }
+
+    /// Where [`PolicySpec::log_std`] lies; empty where there is none.
+    pub fn log_std_range(&self) -> std::ops::Range<usize> {
+        self.log_std.map_or(0..0, |at| at..at + self.action.count())
+    }
+
+    /// The clamped log variances that do not depend on the observation; empty where they do.
+    pub fn free_logvar(&self, flat: &[f32]) -> Vec<f32> {
+        let [low, high] = self.config.logvar;
+        flat[self.log_std_range()].iter().map(|s| (2.0 * s).clamp(low, high)).collect()
     }
 
     /// Floats of all parameters.
     pub fn params(&self) -> usize {
-        self.layers.iter().map(Dense::params).sum()
+        self.layers.iter().map(Dense::params).sum::<usize>() + self.log_std_range().len()
     }
 
     /// Width of the concatenated encodings.
@@ -221,7 +165,8 @@ impl PolicySpec {
                 (d.bias.clone(), vec![d.output], d.bias_of(flat).to_vec()),
             ]
         };
-        self.layers.iter().flat_map(named).collect()
+        let log_std = self.log_std.map(|_| (LOG_STD.to_string(), vec![self.action.count()], flat[self.log_std_range()].to_vec()));
+        self.layers.iter().flat_map(named).chain(log_std).collect()
     }
 
     /// The flat vector from named tensors of exactly these layers.
@@ -231,7 +176,11 @@ impl PolicySpec {
             flat.extend(tensors.f32s(&d.weight, &[d.output, d.input])?);
             flat.extend(tensors.f32s(&d.bias, &[d.output])?);
         }
-        let known = |name: &String| self.layers.iter().any(|d| d.weight == *name || d.bias == *name);
+        if self.log_std.is_some() {
+            flat.extend(tensors.f32s(LOG_STD, &[self.action.count()])?);
+        }
+        let known =
+            |name: &String| (self.log_std.is_some() && name == LOG_STD) || self.layers.iter().any(|d| d.weight == *name || d.bias == *name);
         match tensors.names().into_iter().find(|n| !known(n)) {
             Some(name) => Err(Error::file(tensors.origin(), format!("tensor '{name}' has no place in this policy"))),
             None => Ok(flat),
@@ -265,14 +214,28 @@ impl PolicySpec {
     }
 
     fn head(&mut self, name: &str, width: usize, output: usize) -> Vec<usize> {
-        let mut layers = vec![];
-        for block in 0..self.config.blocks {
-            for i in 0..2 {
-                layers.push(self.dense(&format!("{name}.{block}.{i}"), width, width));
+        let (mut layers, mut last) = (vec![], width);
+        if self.config.hidden.is_empty() {
+            for block in 0..self.config.blocks {
+                for i in 0..2 {
+                    layers.push(self.dense(&format!("{name}.{block}.{i}"), width, width));
+                }
             }
+        } else if !self.config.shared {
+            (layers, last) = self.plain(name, width);
         }
-        layers.push(self.dense(&format!("{name}.out"), width, output));
+        layers.push(self.dense(&format!("{name}.out"), last, output));
         layers
+    }
+
+    /// The layers of `config.hidden` and the last one's width.
+    fn plain(&mut self, name: &str, mut width: usize) -> (Vec<usize>, usize) {
+        let mut layers = vec![];
+        for (i, next) in self.config.hidden.clone().into_iter().enumerate() {
+            layers.push(self.dense(&format!("{name}.{i}"), width, next));
+            width = next;
+        }
+        (layers, width)
     }
 
     fn dense(&mut self, name: &str, input: usize, output: usize) -> usize {
@@ -284,37 +247,4 @@ impl PolicySpec {
         self.layers.push(Dense { weight, bias, input, output, offset });
         self.layers.len() - 1
     }
-}
-
-fn check(config: &PolicyConfig, layout: &ObsLayout, action: usize) -> Result<()> {
-    let bad = |what: String| Err(Error::invalid(what));
-    if layout.version != LAYOUT_VERSION {
-        return bad(format!("observation layout version {} is not the version {LAYOUT_VERSION} of this program", layout.version));
-    }
-    if action == 0 || layout.dim() == 0 {
-        return bad(format!("a policy needs observations and actions, not {} and {action} floats", layout.dim()));
-    }
-    let is_sequence = |g: &ObsGroup| g.shape.len() == 2;
-    for group in &layout.groups {
-        if group.shape.is_empty() || group.shape.len() > 2 || group.shape.contains(&0) {
-            return bad(format!("observation group '{}' has shape {:?}, expected [n] or [frames, n]", group.name, group.shape));
-        }
-        if is_sequence(group) && config.gru.get(&group.name).is_none_or(|&h| h == 0) {
-            return bad(format!("policy.gru.{} is missing: the sequence group '{}' needs a hidden width above 0", group.name, group.name));
-        }
-    }
-    if let Some(name) = config.gru.keys().find(|k| !layout.groups.iter().any(|g| is_sequence(g) && g.name == **k)) {
-        return bad(format!("policy.gru.{name}: the environment has no sequence group of that name"));
-    }
-    if config.octaves > 32 || config.octaves == 0 {
-        return bad(format!("policy.octaves is {}, expected 1 to 32", config.octaves));
-    }
-    if config.trunk == Some(0) {
-        return bad("policy.trunk is 0, expected a width above 0".into());
-    }
-    let [low, high] = config.logvar;
-    if !(low.is_finite() && high.is_finite() && low < high) {
-        return bad(format!("policy.logvar is [{low}, {high}], expected a finite range, low before high"));
-    }
-    Ok(())
 }

@@ -4,14 +4,15 @@ use super::linear::dense;
 use super::pool::{Pool, check, take};
 use super::{Activation, GruCell, Linear, Source, View, ViewMut};
 use crate::Result;
-use crate::agent::{Encoder, Part, PolicySpec, SLOPE};
+use crate::agent::{ActionSpace, Encoder, Nonlinearity, Part, PolicySpec, SLOPE};
 
 /// Most people of one task. Tens of megabytes of weights stream by for each task, so tasks are as large as the batch allows.
 const ROWS: usize = 256;
 
-/// Two residual layers each, then the output.
+/// Residual blocks of two layers each or plain layers, then the output.
 struct Head {
     blocks: Vec<[Linear; 2]>,
+    plain: Vec<(Linear, Activation)>,
     out: Linear,
 }
 
@@ -20,7 +21,10 @@ pub struct PolicyEngine {
     spec: PolicySpec,
     /// One per encoder that is a GRU, in their order.
     cells: Vec<GruCell>,
-    project: Option<Linear>,
+    /// The projection and the shared plain layers.
+    stem: Vec<(Linear, Activation)>,
+    /// Log variances that do not depend on the observation.
+    logvar: Vec<f32>,
     actor: Head,
     critic: Head,
     pool: Pool,
@@ -42,13 +46,24 @@ impl PolicyEngine {
             let (ih, hh) = (&spec.layers[ih], &spec.layers[hh]);
             Some(GruCell::new(ih.weight_of(flat), hh.weight_of(flat), ih.bias_of(flat), hh.bias_of(flat), width))
         };
-        let head = |layers: &[usize]| -> Result<Head> {
-            let blocks = layers.as_chunks::<2>().0.iter().map(|[a, b]| Ok([linear(*a)?, linear(*b)?]));
-            Ok(Head { blocks: blocks.collect::<Result<_>>()?, out: linear(layers[layers.len() - 1])? })
+        let activation = match spec.config.activation {
+            Nonlinearity::Tanh => Activation::Tanh,
+            Nonlinearity::Relu => Activation::Relu,
         };
+        let plain = |layer: &usize| Ok((linear(*layer)?, activation));
+        let head = |layers: &[usize]| -> Result<Head> {
+            let (out, inner) = (linear(layers[layers.len() - 1])?, &layers[..layers.len() - 1]);
+            if !spec.config.hidden.is_empty() {
+                return Ok(Head { blocks: vec![], plain: inner.iter().map(plain).collect::<Result<_>>()?, out });
+            }
+            let blocks = inner.as_chunks::<2>().0.iter().map(|[a, b]| Ok([linear(*a)?, linear(*b)?]));
+            Ok(Head { blocks: blocks.collect::<Result<_>>()?, plain: vec![], out })
+        };
+        let project = spec.project.map(|i| Ok((linear(i)?, Activation::None)));
         Ok(Self {
             cells: spec.encoders.iter().filter_map(cell).collect::<Result<_>>()?,
-            project: spec.project.map(linear).transpose()?,
+            stem: project.into_iter().chain(spec.shared.iter().map(plain)).collect::<Result<_>>()?,
+            logvar: spec.free_logvar(flat),
             actor: head(&spec.actor)?,
             critic: head(&spec.critic)?,
             pool: Pool::default(),
@@ -56,26 +71,31 @@ impl PolicyEngine {
         })
     }
 
-    /// Floats that [`PolicyEngine::forward`] writes for a person: mean A, clamped log variance A, value 1.
+    /// Floats that [`PolicyEngine::forward`] writes for a person: mean A and clamped log variance A, or logits K; then value 1.
     pub fn output_dim(&self) -> usize {
-        2 * self.spec.action + 1
+        match self.spec.action {
+            ActionSpace::Continuous(n) => 2 * n + 1,
+            ActionSpace::Discrete(k) => k + 1,
+        }
     }
 
-    /// Means, log variances and values. `obs`: n x layout.dim(), `out`: n x output_dim().
+    /// Means and log variances (or logits) and values. `obs`: n x layout.dim(), `out`: n x output_dim().
     ///
     /// # Errors
     /// If the lengths do not agree.
     pub fn forward(&self, obs: &[f32], out: &mut [f32]) -> Result<()> {
-        let (width, actions) = (self.output_dim(), 2 * self.spec.action);
+        let width = self.output_dim();
+        let logvars = self.spec.action.count()..width - 1;
         let [low, high] = self.spec.config.logvar;
         self.run(obs, out, width, |rows, trunk, scratch, out| {
-            let (h, inner) = scratch.split_at_mut(trunk.len());
-            h.copy_from_slice(trunk);
-            self.actor.run(rows, h, inner, ViewMut::new(out, width));
-            h.copy_from_slice(trunk);
-            self.critic.run(rows, h, inner, ViewMut::new(&mut out[actions..], width));
+            self.actor.run(rows, trunk, scratch, ViewMut::new(out, width));
+            self.critic.run(rows, trunk, scratch, ViewMut::new(&mut out[width - 1..], width));
             for row in out.chunks_exact_mut(width) {
-                row[self.spec.action..actions].iter_mut().for_each(|v| *v = v.clamp(low, high));
+                let row = &mut row[logvars.clone()];
+                match self.logvar.is_empty() {
+                    true => row.iter_mut().for_each(|v| *v = v.clamp(low, high)),
+                    false => row.copy_from_slice(&self.logvar),
+                }
             }
         })
     }
@@ -85,35 +105,31 @@ impl PolicyEngine {
     /// # Errors
     /// If the lengths do not agree.
     pub fn values(&self, obs: &[f32], out: &mut [f32]) -> Result<()> {
-        self.run(obs, out, 1, |rows, trunk, scratch, out| {
-            let (h, inner) = scratch.split_at_mut(trunk.len());
-            h.copy_from_slice(trunk);
-            self.critic.run(rows, h, inner, ViewMut::new(out, 1));
-        })
+        self.run(obs, out, 1, |rows, trunk, scratch, out| self.critic.run(rows, trunk, scratch, ViewMut::new(out, 1)))
     }
 
-    /// Calls `heads(rows, trunk, scratch of twice its size, out)` for blocks of people.
+    /// Calls `heads(rows, trunk, scratch, out)` for blocks of people.
     fn run(&self, obs: &[f32], out: &mut [f32], width: usize, heads: impl Fn(usize, &[f32], &mut [f32], &mut [f32]) + Sync) -> Result<()> {
         let dim = self.spec.layout.dim();
         let people = obs.len() / dim;
         check("the observations", obs.len(), people * dim)?;
         check("the policy's output", out.len(), people * width)?;
-        let (encoded, trunk) = (self.spec.encoded(), self.actor.out.inputs());
+        let encoded = self.spec.encoded();
+        let trunk = self.stem.last().map_or(encoded, |(layer, _)| layer.outputs());
+        let wide = self.stem.iter().fold(encoded, |w, (layer, _)| w.max(layer.outputs()));
         let cell = self.cells.iter().map(|c| c.scratch(1) + c.size()).max().unwrap_or(0);
-        let scratch = trunk + if self.project.is_some() { encoded } else { 0 } + cell.max(2 * trunk);
+        let heads_scratch = 2 * self.actor.wide().max(self.critic.wide());
+        let scratch = wide * if self.stem.is_empty() { 1 } else { 2 } + cell.max(heads_scratch);
         self.pool.blocks(out, width, ROWS, scratch, |first, rows, out, mut scratch| {
-            let trunk = take(&mut scratch, rows * trunk);
-            let obs = &obs[first * dim..];
-            match &self.project {
-                Some(project) => {
-                    let encodings = take(&mut scratch, rows * encoded);
-                    self.encode(rows, obs, encodings, scratch);
-                    dense(project, rows, encodings, trunk, Source::Fresh, Activation::None);
-                }
-                None => self.encode(rows, obs, trunk, scratch),
+            let mut from = take(&mut scratch, rows * wide);
+            let mut to = take(&mut scratch, if self.stem.is_empty() { 0 } else { rows * wide });
+            self.encode(rows, &obs[first * dim..], &mut from[..rows * encoded], scratch);
+            for (layer, activation) in &self.stem {
+                let size = rows * layer.outputs();
+                dense(layer, rows, from, &mut to[..size], Source::Fresh, *activation);
+                std::mem::swap(&mut from, &mut to);
             }
-            let len = 2 * trunk.len();
-            heads(rows, trunk, &mut scratch[..len], out);
+            heads(rows, &from[..rows * trunk], &mut scratch[..rows * heads_scratch], out);
         });
         Ok(())
     }
@@ -148,8 +164,20 @@ impl PolicyEngine {
 }
 
 impl Head {
-    /// `h`: the trunk, overwritten; `inner`: as large.
-    fn run(&self, rows: usize, h: &mut [f32], inner: &mut [f32], out: ViewMut) {
+    /// Floats of the widest layer's input or output, the last output aside.
+    fn wide(&self) -> usize {
+        self.plain.iter().map(|(layer, _)| layer.inputs().max(layer.outputs())).fold(self.out.inputs(), usize::max)
+    }
+
+    /// `scratch`: at least rows x 2 [`Head::wide`].
+    fn run(&self, rows: usize, trunk: &[f32], scratch: &mut [f32], out: ViewMut) {
+        let (mut h, mut inner) = scratch[..2 * rows * self.wide()].split_at_mut(rows * self.wide());
+        h[..trunk.len()].copy_from_slice(trunk);
+        for (layer, activation) in &self.plain {
+            let size = rows * layer.outputs();
+            dense(layer, rows, h, &mut inner[..size], Source::Fresh, *activation);
+            std::mem::swap(&mut h, &mut inner);
+        }
         for [first, second] in &self.blocks {
             dense(first, rows, h, inner, Source::Fresh, Activation::LeakyRelu(SLOPE));
             dense(second, rows, inner, h, Source::Residual, Activation::LeakyRelu(SLOPE));
@@ -179,28 +207,48 @@ mod tests {
         (0..n).map(|_| rng.random_range(-size..size)).collect()
     }
 
+    /// The engine against burn: every output of 29 people, and log variances on both sides of the clamp where they vary.
+    fn compare(spec: &PolicySpec) -> Vec<f32> {
+        let (people, flat) = (29, noise(spec.params(), 1, 0.3));
+        let obs = noise(people * spec.layout.dim(), 2, 1.0);
+        let engine = PolicyEngine::new(spec, &flat).unwrap();
+        let (width, count) = (engine.output_dim(), spec.action.count());
+        let (mut out, mut values) = (vec![f32::NAN; people * width], vec![f32::NAN; people]);
+        engine.forward(&obs, &mut out).unwrap();
+        engine.values(&obs, &mut values).unwrap();
+        let want = Network::new(spec, &flat, &burn::tensor::Device::flex()).forward(&obs);
+        let floats = |data: burn::tensor::TensorData| data.try_to_vec::<f32>().unwrap();
+        let (mu, value) = (floats(want.mu.into_data()), floats(want.value.into_data()));
+        let logvar = want.logvar.map(|v| floats(v.into_data())).unwrap_or_default();
+        let close = |a: f32, b: f32| assert!((a - b).abs() < 2e-5 * (1.0 + b.abs()), "{a}, burn says {b}");
+        for (p, row) in out.chunks_exact(width).enumerate() {
+            (0..count).for_each(|i| close(row[i], mu[count * p + i]));
+            row[count..width - 1].iter().zip(logvar.chunks_exact(count).nth(p).unwrap_or(&[])).for_each(|(a, b)| close(*a, *b));
+            close(row[width - 1], value[p]);
+            assert_eq!(row[width - 1], values[p]);
+        }
+        logvar
+    }
+
     #[test]
     fn matches_burn() {
         for trunk in [None, Some(33)] {
-            let spec = spec(trunk);
-            let (people, flat) = (29, noise(spec.params(), 1, 0.3));
-            let obs = noise(people * spec.layout.dim(), 2, 1.0);
-            let engine = PolicyEngine::new(&spec, &flat).unwrap();
-            let (mut out, mut values) = (vec![f32::NAN; people * 13], vec![f32::NAN; people]);
-            engine.forward(&obs, &mut out).unwrap();
-            engine.values(&obs, &mut values).unwrap();
-            let want = Network::new(&spec, &flat, &burn::tensor::Device::flex()).forward(&obs);
-            let floats = |data: burn::tensor::TensorData| data.try_to_vec::<f32>().unwrap();
-            let (mu, logvar, value) = (floats(want.mu.into_data()), floats(want.logvar.into_data()), floats(want.value.into_data()));
-            let close = |a: f32, b: f32| assert!((a - b).abs() < 2e-5 * (1.0 + b.abs()), "{a}, burn says {b}");
-            for (p, row) in out.chunks_exact(13).enumerate() {
-                (0..6).for_each(|i| close(row[i], mu[6 * p + i]));
-                (0..6).for_each(|i| close(row[6 + i], logvar[6 * p + i]));
-                close(row[12], value[p]);
-                assert_eq!(row[12], values[p]);
-            }
+            let logvar = compare(&spec(trunk));
             assert!(logvar.contains(&0.05) && logvar.contains(&-0.05) && logvar.iter().any(|v| v.abs() < 0.05), "the clamp is not tested");
         }
+    }
+
+    #[test]
+    fn plain_layers_match_burn() {
+        let layout = ObsLayout::new(vec![ObsGroup { name: "state".into(), shape: vec![7] }, ObsGroup { name: "x".into(), shape: vec![1] }]);
+        let make = |config: serde_json::Value, action: ActionSpace| {
+            PolicySpec::new(serde_json::from_value(config).unwrap(), layout.clone(), action).unwrap()
+        };
+        let free = serde_json::json!({"octaves": 2, "hidden": [9, 40, 5], "log_std": -0.05, "logvar": [-0.2, 0.3]});
+        let logvar = compare(&make(free, ActionSpace::Continuous(3)));
+        assert_eq!(logvar.len(), 29 * 3);
+        let shared = serde_json::json!({"octaves": 2, "trunk": 6, "hidden": [20, 11], "activation": "relu", "shared": true});
+        assert!(compare(&make(shared, ActionSpace::Discrete(4))).is_empty());
     }
 
     #[test]

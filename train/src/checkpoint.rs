@@ -7,7 +7,7 @@
 use crate::ppo::Progress;
 use crate::stats::EpochStats;
 use crate::{AdamW, Error, Result};
-use egogen::agent::{ObsLayout, PolicyConfig, PolicySpec};
+use egogen::agent::{ActionSpace, ObsLayout, PolicyConfig, PolicySpec};
 use egogen::io::{Precision, Tensors, content_hash, pack_tensors, write_atomic};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -38,8 +38,8 @@ pub struct Description {
     pub layout: ObsLayout,
     /// Sizes of the policy.
     pub policy: PolicyConfig,
-    /// Floats of an action.
-    pub action: usize,
+    /// What an action is.
+    pub action: ActionSpace,
     /// Content hashes of what observations and actions stand on.
     pub origin: BTreeMap<String, String>,
     /// Figures of the last test before it.

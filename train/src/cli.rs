@@ -6,6 +6,7 @@ use crate::registry::{Purpose, Registry};
 use crate::trainer::{Outcome, Trainer, policy_spec};
 use crate::{Error, Result};
 use clap::Parser;
+use egogen::agent::ActionSpace;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -136,7 +137,11 @@ fn describe(plan: &Plan, registry: &Registry) -> Result<u8> {
     let spec = policy_spec(plan, made.env.spec())?;
     let per_epoch = plan.updates_per_epoch * recipe.run.collect_steps as u64;
     println!("{}", recipe.to_toml()?);
-    println!("# observation: {} floats, action: {} floats", spec.layout.dim(), spec.action);
+    let action = match spec.action {
+        ActionSpace::Continuous(n) => format!("{n} floats"),
+        ActionSpace::Discrete(k) => format!("one of {k}"),
+    };
+    println!("# observation: {} floats, action: {action}", spec.layout.dim());
     println!("# parameters: {}", spec.params());
     println!("# updates: {} per epoch, each from {} environments x {} steps", plan.updates_per_epoch, recipe.run.envs, plan.horizon);
     println!("# environment steps: {per_epoch} per epoch, {} in all", per_epoch * recipe.run.epochs);

@@ -1,12 +1,9 @@
 //! Steps environments with the current policy and records what learning needs.
 
-use crate::policy::{Acts, Policy};
+use crate::acts::Acts;
+use crate::policy::Policy;
 use crate::{Error, Result};
-use egogen::agent::log_prob_of;
-use egogen::rng::stream;
 use egogen_envs::{StepResult, VecEnv};
-use rand_distr::{Distribution, StandardNormal};
-use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// One finished episode.
@@ -94,7 +91,7 @@ impl Collector {
             let acts = policy.act(&self.obs)?;
             let first = out.reward.len();
             self.record(&acts, &mut out);
-            let actions = out.actions.len() - acts.mu.len()..;
+            let actions = out.actions.len() - envs * self.env.spec().action.width()..;
             self.env.step(&out.actions[actions], &mut self.result)?;
             self.take_result(&mut out)?;
             let width = self.obs.len() / envs;
@@ -115,9 +112,7 @@ impl Collector {
     /// Draws and records the actions for the current observations.
     fn record(&mut self, acts: &Acts, out: &mut Rollout) {
         let actions = acts.sample(self.seed, "actions", self.progress.steps);
-        let width = acts.mu.len() / acts.value.len();
-        let rows = acts.mu.chunks_exact(width).zip(acts.logvar.chunks_exact(width)).zip(actions.chunks_exact(width));
-        out.log_prob.extend(rows.map(|((m, v), a)| log_prob_of(m, v, a)));
+        out.log_prob.extend(acts.log_prob(&actions));
         out.obs.extend_from_slice(&self.obs);
         out.actions.extend_from_slice(&actions);
         out.value.extend_from_slice(&acts.value);
@@ -173,21 +168,7 @@ fn check_finite(what: &str, values: &[f32]) -> Result<()> {
     }
 }
 
-impl Acts {
-    /// mean + sigma x noise, the noise of row i from stream (seed, purpose, step x rows + i).
-    pub fn sample(&self, seed: u64, purpose: &str, step: u64) -> Vec<f32> {
-        let rows = self.value.len();
-        let width = self.mu.len() / rows.max(1);
-        let mut out = self.mu.clone();
-        out.par_chunks_exact_mut(width).zip(self.logvar.par_chunks_exact(width)).enumerate().for_each(|(i, (row, logvar))| {
-            let noise = StandardNormal.sample_iter(stream(seed, purpose, step * rows as u64 + i as u64));
-            row.iter_mut().zip(logvar).zip(noise).for_each(|((a, v), e): (_, f32)| *a += (0.5 * v).exp() * e);
-        });
-        out
-    }
-}
-
-/// The first episode of every environment after a reset from `seed`; with the policy's noise or with its mean alone.
+/// The first episode of every environment after a reset from `seed`; with the policy's noise or without.
 pub fn test_episodes(env: &mut dyn VecEnv, policy: &Policy, seed: u64, noise: bool) -> Result<Vec<Episode>> {
     let (envs, figures) = (env.num_envs(), env.spec().episode.len());
     let (mut obs, mut result) = (Vec::new(), StepResult::default());
@@ -196,7 +177,7 @@ pub fn test_episodes(env: &mut dyn VecEnv, policy: &Policy, seed: u64, noise: bo
     env.reset(seed, &mut obs)?;
     for step in 0.. {
         let acts = policy.act(&obs)?;
-        let actions = if noise { acts.sample(seed, "test actions", step) } else { acts.mu };
+        let actions = if noise { acts.sample(seed, "test actions", step) } else { acts.best() };
         env.step(&actions, &mut result)?;
         for i in (0..envs).filter(|&i| done[i].is_none()).collect::<Vec<_>>() {
             running[i].0 += result.reward[i];
@@ -221,7 +202,7 @@ const MAX_TEST_STEPS: u64 = 10_000;
 mod tests {
     use super::*;
     use crate::policy::Compute;
-    use egogen::agent::{ObsGroup, ObsLayout, PolicySpec};
+    use egogen::agent::{ObsGroup, ObsLayout, PolicySpec, log_prob_of};
     use egogen_envs::point::PointGoal;
 
     const ENVS: usize = 8;

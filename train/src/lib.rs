@@ -1,5 +1,6 @@
 //! The learning: collector, GAE, PPO, trainer, checkpoints, loggers; and the programs.
 
+mod acts;
 mod backward;
 pub mod checkpoint;
 pub mod cli;
@@ -23,13 +24,14 @@ mod shards;
 pub mod stats;
 pub mod trainer;
 
+pub use acts::Acts;
 pub use backward::Tape;
 pub use collector::{Collector, Episode, Rollout, test_episodes};
 pub use error::{Error, Result};
 pub use gae::{Steps, gae};
 pub use loss::{Batch, Losses, gradients};
 pub use optim::{AdamConfig, AdamW, clip_scale, global_norm};
-pub use policy::{Acts, Compute, Policy};
+pub use policy::{Compute, Policy};
 pub use ppo::{Learner, PpoConfig, PriorForm, Progress, Rules, UpdateStats};
 pub use running::Running;
 pub use schedule::Schedule;

@@ -1,18 +1,11 @@
 //! The policy as it acts: no gradients, a batch of observations in, plain floats out.
 
+use crate::acts::Acts;
 use crate::{Error, Result};
 use burn::tensor::{Device, Tensor};
 use egogen::agent::{Network, PolicySpec};
 use egogen::device::DeviceChoice;
 use egogen::kernels::PolicyEngine;
-
-/// Mean, log variance (n x A each) and value (n) for n observations.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Acts {
-    pub mu: Vec<f32>,
-    pub logvar: Vec<f32>,
-    pub value: Vec<f32>,
-}
 
 /// Who computes: the project's own layers on the processor, or burn on a device.
 #[derive(Clone, Debug)]
@@ -49,19 +42,20 @@ impl Policy {
         Ok(Self { spec: spec.clone(), acting })
     }
 
-    /// Means, log variances and values of observation rows.
+    /// What the policy says of observation rows.
     pub fn act(&self, obs: &[f32]) -> Result<Acts> {
         match &self.acting {
             Acting::Own(engine) => {
-                let (a, width) = (self.spec.action, engine.output_dim());
+                let (a, width) = (self.spec.action.count(), engine.output_dim());
                 let mut out = vec![0.0; obs.len() / self.spec.layout.dim() * width];
                 engine.forward(obs, &mut out)?;
                 let columns = |from: usize, to: usize| out.chunks_exact(width).flat_map(|row| &row[from..to]).copied().collect();
-                Ok(Acts { mu: columns(0, a), logvar: columns(a, 2 * a), value: columns(2 * a, width) })
+                Ok(Acts { mu: columns(0, a), logvar: columns(a, width - 1), value: columns(width - 1, width) })
             }
             Acting::Burn(network) => {
                 let out = network.forward(obs);
-                Ok(Acts { mu: floats(out.mu)?, logvar: floats(out.logvar)?, value: floats(out.value)? })
+                let logvar = out.logvar.map(floats).transpose()?.unwrap_or_default();
+                Ok(Acts { mu: floats(out.mu)?, logvar, value: floats(out.value)? })
             }
         }
     }

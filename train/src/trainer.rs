@@ -45,10 +45,14 @@ pub struct Trainer {
 
 /// The policy that a plan trains in these environments.
 pub fn policy_spec(plan: &Plan, env: &EnvSpec) -> Result<PolicySpec> {
-    let ActionSpace::Continuous(action) = env.action else {
-        return Err(Error::config(format!("env '{}' has discrete actions; PPO here draws continuous ones", plan.recipe.env)));
-    };
-    PolicySpec::new(plan.recipe.policy.clone(), ObsLayout::new(env.obs.clone()), action)
+    let ppo = &plan.recipe.ppo;
+    if matches!(env.action, ActionSpace::Discrete(_)) && ppo.kl_prior > 0.0 {
+        let (name, kl) = (&plan.recipe.name, ppo.kl_prior);
+        return Err(Error::config(format!(
+            "recipe '{name}': ppo.kl_prior is {kl}, expected 0: the actions are discrete and have no prior"
+        )));
+    }
+    PolicySpec::new(plan.recipe.policy.clone(), ObsLayout::new(env.obs.clone()), env.action)
         .map_err(|e| Error::config(format!("recipe '{}': {e}", plan.recipe.name)))
 }
 

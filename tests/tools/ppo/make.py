@@ -9,7 +9,7 @@ import torch
 from safetensors.numpy import save_file
 from tianshou.data import Batch, ReplayBuffer
 from tianshou.policy import BasePolicy, PPOPolicy
-from torch.distributions import Independent, Normal, kl_divergence
+from torch.distributions import Categorical, Independent, Normal, kl_divergence
 
 OUT = {}
 torch.manual_seed(3)
@@ -213,6 +213,60 @@ def tianshou_learn(name, net, actor, critic, dist, obs, action, variants, noise=
         assert variant == "plain" or not np.allclose(f[:2], figures["plain"][:2], rtol=1e-3), f"{variant} changes nothing"
 
 
+class Small(torch.nn.Module):
+    """Plain layers in the layout of src/agent/spec.rs: one vector of 5 floats."""
+
+    def __init__(self, outputs, hidden=(8, 6), activation=torch.tanh, shared=False, log_std=None):
+        super().__init__()
+        self.activation = activation
+
+        def layers(width):
+            sizes = [width, *hidden]
+            return {str(i): torch.nn.Linear(a, b) for i, (a, b) in enumerate(zip(sizes, sizes[1:]))}
+
+        self.shared = torch.nn.ModuleDict(layers(5) if shared else {})
+        own = (lambda: {}) if shared else (lambda: layers(5))
+        self.actor = torch.nn.ModuleDict(own() | {"out": torch.nn.Linear(hidden[-1], outputs)})
+        self.critic = torch.nn.ModuleDict(own() | {"out": torch.nn.Linear(hidden[-1], 1)})
+        if log_std is not None:
+            self.actor.register_parameter("log_std", torch.nn.Parameter(torch.full((outputs,), log_std)))
+
+    def run(self, head, h):
+        for name in self.shared:
+            h = self.activation(self.shared[name](h))
+        for name in head:
+            h = head[name](h) if name == "out" else self.activation(head[name](h))
+        return h
+
+
+def small(name, net, dist, action):
+    """A small network through Tianshou; `dist` makes the distribution from (network, actor's output)."""
+    for key, p in net.named_parameters():
+        put(f"{name}.param/{key}", p)
+    actor = lambda net, obs: (net.run(net.actor, obs),)
+    critic = lambda net, obs: net.run(net.critic, obs)[:, 0]
+    tianshou_learn(name, net, actor, critic, lambda out: dist(net, out), torch.randn(13, 5), action, VARIANTS)
+
+
+def distributions(rows=7, dims=5):
+    """Log densities, entropies and divergences as torch.distributions has them."""
+    mu, logvar, action = torch.randn(rows, dims), 0.7 * torch.randn(rows, dims), 2 * torch.randn(rows, dims)
+    each = Normal(mu, (logvar / 2).exp())
+    pi, prior = Independent(each, 1), Independent(Normal(torch.zeros_like(mu), torch.ones_like(mu)), 1)
+    choice = torch.arange(rows) % dims
+    softmax = Categorical(logits=mu)
+    named = dict(mu=mu, logvar=logvar, action=action, log_prob=pi.log_prob(action), entropy=pi.entropy(), kl=kl_divergence(pi, prior))
+    named |= dict(choice=choice, choice_log_prob=softmax.log_prob(choice), choice_entropy=softmax.entropy())
+    for key, v in named.items():
+        put(f"dist.{key}", v)
+
+
+def orthogonal(draws=4000, rows=6, columns=9):
+    """Mean, variance and fourth moment of the entries of torch's orthogonal weights, and the mean of their diagonal."""
+    w = torch.stack([torch.nn.init.orthogonal_(torch.empty(rows, columns), 2**0.5) for _ in range(draws)])
+    put("orthogonal.moments", [w.mean(), w.pow(2).mean(), w.pow(4).mean(), w.diagonal(dim1=1, dim2=2).mean()])
+
+
 VARIANTS = {
     "plain": {},
     "dual": dict(dual_clip=1.3),
@@ -230,4 +284,10 @@ tianshou_returns()
 std = lambda net, obs: (net(obs)[0], (net(obs)[1] / 2).exp())
 value = lambda net, obs: net(obs)[2]
 tianshou_learn("paper", paper, std, value, gaussian, torch.randn(13, 30), torch.randn(13, 4), VARIANTS)
+free = lambda net, mu: gaussian(mu, net.actor.log_std.exp().expand_as(mu))
+small("free", Small(3, log_std=-0.5), free, torch.randn(13, 3))
+choices = lambda net, logits: Categorical(logits=logits)
+small("choice", Small(4, activation=torch.relu, shared=True), choices, torch.randint(4, (13,)))
+distributions()
+orthogonal()
 save_file(OUT, Path(__file__).parents[2] / "fixtures" / "ppo.safetensors")

@@ -4,28 +4,45 @@ use super::{Batch, Losses};
 use crate::PpoConfig;
 use crate::backward::Tape;
 use crate::ppo::PriorForm;
-use egogen::agent::{PolicySpec, log_prob_of};
+use egogen::agent::{ActionSpace, PolicySpec, log_prob_of, log_softmax_of};
 use std::f64::consts::TAU;
 use std::ops::Range;
 
 /// One shard's share of the minibatch's loss, with gradients by hand.
 pub(super) fn shard(spec: &PolicySpec, params: &[f32], batch: &Batch, rows: Range<usize>, ppo: &PpoConfig) -> (Vec<f32>, Losses, f64) {
-    let (dim, width, count) = (spec.layout.dim(), spec.action, batch.returns.len() as f32);
+    let (dim, width, outputs) = (spec.layout.dim(), spec.action.width(), spec.outputs());
+    let count = batch.returns.len() as f32;
     let tape = Tape::forward(spec, params, &batch.obs[rows.start * dim..rows.end * dim]);
-    let mut d_action = vec![0.0; rows.len() * 2 * width];
+    let mut d_action = vec![0.0; rows.len() * outputs];
     let mut d_value = Vec::with_capacity(rows.len());
     let (mut losses, mut ratio_error) = (Losses::default(), 0.0f64);
-    let outputs = tape.action().chunks_exact(2 * width).zip(tape.value());
-    for ((i, (out, &value)), d) in rows.zip(outputs).zip(d_action.chunks_exact_mut(2 * width)) {
-        let action = &batch.actions[i * width..(i + 1) * width];
-        let row = Row { out, action, old_log_prob: batch.old_log_prob[i], advantage: batch.advantage[i], clamp: spec.config.logvar };
+    // Log variances that do not depend on the observation: before the clamp, their gradient in a row and in all.
+    let free: Vec<f32> = params[spec.log_std_range()].iter().map(|s| 2.0 * s).collect();
+    let (mut d_row, mut d_free) = (free.clone(), vec![0.0; free.len()]);
+    let said = tape.action().chunks_exact(outputs).zip(tape.value());
+    for ((i, (out, &value)), d) in rows.zip(said).zip(d_action.chunks_exact_mut(outputs)) {
         let (error, moves) = value_error(value, batch.old_value[i], batch.returns[i], ppo);
         losses.value += error * error / f64::from(count);
         d_value.push(if moves { ppo.value * 2.0 * error as f32 / count } else { 0.0 });
-        let beyond = row.gradient(ppo, count, d, &mut losses);
+        let action = &batch.actions[i * width..(i + 1) * width];
+        let row = Row { action, old_log_prob: batch.old_log_prob[i], advantage: batch.advantage[i], ppo, count };
+        let beyond = match spec.action {
+            ActionSpace::Discrete(_) => row.choice(out, d, &mut losses),
+            ActionSpace::Continuous(_) if free.is_empty() => {
+                let (out, d) = (out.split_at(width), d.split_at_mut(width));
+                row.gaussian(out, spec.config.logvar, d, &mut losses)
+            }
+            ActionSpace::Continuous(_) => {
+                let beyond = row.gaussian((out, &free), spec.config.logvar, (d, &mut d_row), &mut losses);
+                d_free.iter_mut().zip(&d_row).for_each(|(sum, d)| *sum += d);
+                beyond
+            }
+        };
         ratio_error = ratio_error.max(beyond.abs());
     }
-    (tape.backward(d_action, d_value), losses, ratio_error)
+    let mut grad = tape.backward(d_action, d_value);
+    grad[spec.log_std_range()].iter_mut().zip(d_free).for_each(|(g, d)| *g = 2.0 * d);
+    (grad, losses, ratio_error)
 }
 
 /// The error that counts, and whether it moves with the value. With `value_clip` the value may leave the old one by at most the clip
@@ -40,38 +57,41 @@ fn value_error(value: f32, old: f32, wanted: f32, ppo: &PpoConfig) -> (f64, bool
     if clipped.abs() > error.abs() { (clipped, false) } else { (error, true) }
 }
 
-/// One person's action within a minibatch.
+/// One person's action within a minibatch of `count`.
 struct Row<'a> {
-    /// Means, then log variances before the clamp.
-    out: &'a [f32],
     action: &'a [f32],
     old_log_prob: f32,
     /// Normalised.
     advantage: f32,
-    clamp: [f32; 2],
+    ppo: &'a PpoConfig,
+    count: f32,
 }
 
 impl Row<'_> {
-    /// Adds this row's terms, divided by `count`, to `losses`, and writes the gradient with respect to `out`. Returns ratio - 1.
-    fn gradient(&self, ppo: &PpoConfig, count: f32, d: &mut [f32], losses: &mut Losses) -> f64 {
-        let width = self.action.len();
-        let (mu, raw) = self.out.split_at(width);
-        let [low, high] = self.clamp;
-        let logvar: Vec<f32> = raw.iter().map(|v| v.clamp(low, high)).collect();
-        let log_ratio = f64::from(log_prob_of(mu, &logvar, self.action) - self.old_log_prob);
+    /// Adds the clipped surrogate's terms to `losses`. Returns its gradient with respect to the log density, and ratio - 1.
+    fn surrogate(&self, log_prob: f32, losses: &mut Losses) -> (f32, f64) {
+        let log_ratio = f64::from(log_prob - self.old_log_prob);
         let (ratio, beyond) = (log_ratio.exp(), log_ratio.exp_m1());
-        let (clip, advantage, share) = (f64::from(ppo.clip), f64::from(self.advantage), 1.0 / f64::from(count));
+        let (clip, advantage, share) = (f64::from(self.ppo.clip), f64::from(self.advantage), 1.0 / f64::from(self.count));
         let (plain, clipped) = (ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage);
         let pessimist = plain.min(clipped);
-        let floor = ppo.dual_clip.filter(|_| advantage < 0.0).map_or(f64::NEG_INFINITY, |c| f64::from(c) * advantage);
+        let floor = self.ppo.dual_clip.filter(|_| advantage < 0.0).map_or(f64::NEG_INFINITY, |c| f64::from(c) * advantage);
         losses.policy -= pessimist.max(floor) * share;
         losses.approx_kl += (beyond - log_ratio) * share;
         losses.clip_fraction += if beyond.abs() > clip { share } else { 0.0 };
         // Where the clipped term is the smaller one, or both are below the floor, the ratio's gradient is zero.
-        let d_log_prob = if plain <= clipped && pessimist >= floor { -(plain * share) as f32 } else { 0.0 };
+        let moves = plain <= clipped && pessimist >= floor;
+        (if moves { -(plain * share) as f32 } else { 0.0 }, beyond)
+    }
+
+    /// Adds a Gaussian's terms to `losses` and writes the gradients of mean and log variance before its clamp. Returns ratio - 1.
+    fn gaussian(&self, (mu, raw): (&[f32], &[f32]), [low, high]: [f32; 2], d: (&mut [f32], &mut [f32]), losses: &mut Losses) -> f64 {
+        let (width, ppo, count) = (self.action.len(), self.ppo, self.count);
+        let logvar: Vec<f32> = raw.iter().map(|v| v.clamp(low, high)).collect();
+        let (d_log_prob, beyond) = self.surrogate(log_prob_of(mu, &logvar, self.action), losses);
         let prior = ppo.kl_prior / width as f32 / count;
         let spread = if ppo.kl_prior_form == PriorForm::Full { prior } else { 0.0 };
-        let (d_mu, d_logvar) = d.split_at_mut(width);
+        let (d_mu, d_logvar) = d;
         let (mut bits, mut kl) = (0.0f64, 0.0f64);
         for k in 0..width {
             let (off, precision, variance) = (self.action[k] - mu[k], (-logvar[k]).exp(), logvar[k].exp());
@@ -82,8 +102,24 @@ impl Row<'_> {
             bits += 0.5 * (f64::from(logvar[k]) + 1.0 + TAU.ln());
             kl += 0.5 * f64::from(mu[k] * mu[k] + variance - logvar[k] - 1.0);
         }
+        let share = 1.0 / f64::from(count);
         losses.entropy += bits * share;
         losses.kl_prior += kl / width as f64 * share;
+        beyond
+    }
+
+    /// [`Row::gaussian`] for the softmax of `logits`, which has no prior: d log p_c / d logit_k = [k = c] - p_k, and
+    /// dH / d logit_k = -p_k (log p_k + H).
+    fn choice(&self, logits: &[f32], d: &mut [f32], losses: &mut Losses) -> f64 {
+        let log_p = log_softmax_of(logits);
+        let chosen = self.action[0] as usize;
+        let (d_log_prob, beyond) = self.surrogate(log_p[chosen], losses);
+        let entropy = -log_p.iter().map(|l| l.exp() * l).sum::<f32>();
+        for (k, (d, l)) in d.iter_mut().zip(&log_p).enumerate() {
+            let p = l.exp();
+            *d = d_log_prob * (f32::from(k == chosen) - p) + self.ppo.entropy / self.count * p * (l + entropy);
+        }
+        losses.entropy += f64::from(entropy) / f64::from(self.count);
         beyond
     }
 }

@@ -3,7 +3,7 @@
 use super::*;
 use crate::{Policy, PriorForm};
 use egogen::DeviceChoice;
-use egogen::agent::{ObsGroup, ObsLayout};
+use egogen::agent::{ActionSpace, ObsGroup, ObsLayout};
 use egogen::io::{Precision, Tensors, pack_tensors};
 use std::collections::BTreeMap;
 
@@ -30,13 +30,15 @@ fn paper(trunk: Option<usize>) -> PolicySpec {
     PolicySpec::new(serde_json::from_value(config).unwrap(), layout, 4).unwrap()
 }
 
-fn batch(name: &str, dim: usize, width: usize) -> Batch {
+fn batch(name: &str, dim: usize) -> Batch {
     let t = crate::fixture();
+    let actions = format!("{name}.action");
+    let shape = t.shape(&actions).unwrap();
     let get = |what: &str, shape: &[usize]| t.f32s(&format!("{name}.{what}"), shape).unwrap();
     let values = if t.names().iter().any(|n| *n == format!("{name}.old_value")) { "old_value" } else { "value" };
     Batch {
         obs: get("obs", &[ROWS, dim]),
-        actions: get("action", &[ROWS, width]),
+        actions: t.f32s(&actions, &shape).unwrap(),
         old_log_prob: get("old", &[ROWS]),
         old_value: get(values, &[ROWS]),
         advantage: get("advantage", &[ROWS]),
@@ -82,7 +84,7 @@ fn everywhere(run: impl Fn(&Compute, &Shards, &str)) {
 fn losses_and_gradients_agree_with_torch() {
     let t = crate::fixture();
     for (name, trunk) in [("sum", None), ("project", Some(10))] {
-        let (spec, batch) = (paper(trunk), batch(name, 30, 4));
+        let (spec, batch) = (paper(trunk), batch(name, 30));
         let (params, grads) = (flat(&spec, &format!("{name}.param")), flat(&spec, &format!("{name}.grad")));
         let ppo = ppo(serde_json::json!({"kl_prior": 0.4}));
         everywhere(|compute, shards, what| {
@@ -101,7 +103,7 @@ fn losses_and_gradients_agree_with_torch() {
 
 #[test]
 fn the_penalty_on_means_agrees_with_torch() {
-    let (spec, batch) = (paper(None), batch("sum", 30, 4));
+    let (spec, batch) = (paper(None), batch("sum", 30));
     let (params, grads) = (flat(&spec, "sum.param"), flat(&spec, "sum.grad_mean"));
     let mean = ppo(serde_json::json!({"kl_prior": 0.4, "kl_prior_form": "mean"}));
     let figures = crate::fixture().f32s("sum.figures", &[6]).unwrap();
@@ -138,8 +140,26 @@ fn agrees_with_tianshou(name: &str, spec: &PolicySpec, params: &[f32], batch: &B
 #[test]
 fn the_papers_network_learns_as_with_tianshou() {
     let spec = paper(None);
-    let (params, batch) = (flat(&spec, "sum.param"), batch("paper", 30, 4));
+    let (params, batch) = (flat(&spec, "sum.param"), batch("paper", 30));
     for (variant, ppo) in variants() {
         agrees_with_tianshou("paper", &spec, &params, &batch, &ppo, variant);
+    }
+}
+
+/// Plain layers over a vector of five floats.
+fn small(config: serde_json::Value, action: ActionSpace) -> PolicySpec {
+    let layout = ObsLayout::new(vec![ObsGroup { name: "state".into(), shape: vec![5] }]);
+    PolicySpec::new(serde_json::from_value(config).unwrap(), layout, action).unwrap()
+}
+
+#[test]
+fn small_networks_learn_as_with_tianshou() {
+    let free = small(serde_json::json!({"hidden": [8, 6], "log_std": -0.5}), ActionSpace::Continuous(3));
+    let choice = small(serde_json::json!({"hidden": [8, 6], "activation": "relu", "shared": true}), ActionSpace::Discrete(4));
+    for (name, spec) in [("free", free), ("choice", choice)] {
+        let (params, batch) = (flat(&spec, &format!("{name}.param")), batch(name, 5));
+        for (variant, ppo) in variants() {
+            agrees_with_tianshou(name, &spec, &params, &batch, &ppo, variant);
+        }
     }
 }

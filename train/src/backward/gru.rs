@@ -1,0 +1,112 @@
+//! The GRU over a sequence group and its backward pass through time.
+
+use super::{dense, dense_grad, parts_mut, rows_of, weight};
+use crate::primitives::layers::add_rows;
+use egogen::agent::{Dense, Encoder, Part, PolicySpec};
+use egogen::kernels::{Activation, product};
+
+/// A GRU run from the zero state: r, z = s(x W + b + h U + c), n = tanh(x W + b + r (h U + c)), h' = n + z (h - n).
+pub(super) struct Gru {
+    rows: usize,
+    hidden: usize,
+    /// frames x rows x width.
+    x: Vec<f32>,
+    /// frames x rows x 4H: r, z, n, and the state's share of n's input.
+    gates: Vec<f32>,
+    /// frames x rows x H: the state after each frame.
+    states: Vec<f32>,
+}
+
+impl Gru {
+    pub fn of(spec: &PolicySpec, flat: &[f32], encoder: &Encoder, obs: &[f32]) -> Option<Self> {
+        let Part::Gru { frames, width, ih, hh } = encoder.part else { return None };
+        let dim = spec.layout.dim();
+        let frame = |t: usize| {
+            let at = encoder.start + t * width;
+            obs.chunks_exact(dim).flat_map(move |row| &row[at..at + width])
+        };
+        let x: Vec<f32> = (0..frames).flat_map(frame).copied().collect();
+        let (rows, hidden) = (obs.len() / dim, encoder.output);
+        let n = rows * hidden;
+        let input = dense(&spec.layers[ih], flat, &x);
+        let mut gru = Self { rows, hidden, x, gates: vec![0.0; frames * 4 * n], states: vec![0.0; frames * n] };
+        for t in 0..frames {
+            let (past, states) = gru.states.split_at_mut(t * n);
+            // The first state is zero: its share is the bias alone.
+            let (before, share) = match t {
+                0 => (vec![0.0; n], spec.layers[hh].bias_of(flat).repeat(rows)),
+                _ => (past[(t - 1) * n..].to_vec(), dense(&spec.layers[hh], flat, &past[(t - 1) * n..])),
+            };
+            let people = input[t * 3 * n..].chunks_exact(3 * hidden).zip(share.chunks_exact(3 * hidden));
+            let states = before.chunks_exact(hidden).zip(states.chunks_exact_mut(hidden));
+            let gates = gru.gates[t * 4 * n..].chunks_exact_mut(4 * hidden);
+            for (((input, share), (before, after)), gates) in people.zip(states).zip(gates) {
+                step(input, share, before, gates, after);
+            }
+        }
+        Some(gru)
+    }
+
+    /// Each person's last state.
+    pub fn last(&self) -> impl Iterator<Item = &[f32]> {
+        self.states[self.states.len() - self.rows * self.hidden..].chunks_exact(self.hidden)
+    }
+
+    /// Adds to `grad` from `d`, the gradient of the last state.
+    pub fn backward(&self, ih: &Dense, hh: &Dense, flat: &[f32], mut d: Vec<f32>, grad: &mut [f32]) {
+        let (h, n) = (self.hidden, self.rows * self.hidden);
+        let mut input = vec![0.0; self.gates.len() / 4 * 3];
+        let mut share = input.clone();
+        for t in (0..self.states.len() / n).rev() {
+            let before = if t > 0 { &self.states[(t - 1) * n..t * n] } else { &[] };
+            let people = self.gates[t * 4 * n..].chunks_exact(4 * h).zip(d.chunks_exact_mut(h));
+            let out = input[t * 3 * n..].chunks_exact_mut(3 * h).zip(share[t * 3 * n..].chunks_exact_mut(3 * h));
+            for (i, ((gates, d), (input, share))) in people.zip(out).enumerate() {
+                step_back(gates, before.get(i * h..(i + 1) * h), d, input, share);
+            }
+            if t > 0 {
+                product(rows_of(&share[t * 3 * n..(t + 1) * 3 * n], 3 * h), weight(hh, flat), &mut d, h, true);
+            }
+        }
+        dense_grad(ih, &input, &self.x, grad);
+        // Only later frames have a state before them; the bias acts in all.
+        let (weight, bias) = parts_mut(hh, grad);
+        let later = &share[3 * n..];
+        product(rows_of(later, 3 * h).t(), rows_of(&self.states[..later.len() / 3], h), weight, h, true);
+        add_rows(&share, bias);
+    }
+}
+
+/// One person's gates (r, z, n and the state's share of n) and next state.
+fn step(input: &[f32], share: &[f32], before: &[f32], gates: &mut [f32], after: &mut [f32]) {
+    let h = after.len();
+    let (rz, rest) = gates.split_at_mut(2 * h);
+    let (new, kept) = rest.split_at_mut(h);
+    rz.iter_mut().zip(input).zip(share).for_each(|((g, i), s)| *g = i + s);
+    Activation::Sigmoid.apply(rz);
+    kept.copy_from_slice(&share[2 * h..]);
+    for k in 0..h {
+        new[k] = input[2 * h + k] + rz[k] * kept[k];
+    }
+    Activation::Tanh.apply(new);
+    for k in 0..h {
+        after[k] = new[k] + rz[h + k] * (before[k] - new[k]);
+    }
+}
+
+/// Turns `d` from the gradient of the state after into that of the state before, but for the way through the share; writes the
+/// gradients of both shares of the gates. `before` is `None` for zeros.
+fn step_back(gates: &[f32], before: Option<&[f32]>, d: &mut [f32], input: &mut [f32], share: &mut [f32]) {
+    let h = d.len();
+    for k in 0..h {
+        let (r, z, new, kept) = (gates[k], gates[h + k], gates[2 * h + k], gates[3 * h + k]);
+        let before = before.map_or(0.0, |b| b[k]);
+        let dn = d[k] * (1.0 - z) * (1.0 - new * new);
+        input[k] = dn * kept * r * (1.0 - r);
+        input[h + k] = d[k] * (before - new) * z * (1.0 - z);
+        input[2 * h + k] = dn;
+        share[2 * h + k] = dn * r;
+        d[k] *= z;
+    }
+    share[..2 * h].copy_from_slice(&input[..2 * h]);
+}

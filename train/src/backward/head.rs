@@ -1,0 +1,104 @@
+//! Actor and critic behind the encodings, forwards and backwards.
+
+use super::{dense, dense_back, dense_grad, rows_of, weight};
+use egogen::agent::{Nonlinearity, PolicySpec, SLOPE};
+use egogen::kernels::{Activation, product};
+
+/// Activations of plain layers in a row, each followed by the policy's nonlinearity.
+pub(super) struct Chain {
+    /// rows x W: the input of each layer; the last layer's activations go on to whoever comes next.
+    inputs: Vec<Vec<f32>>,
+}
+
+impl Chain {
+    /// Also gives what the last layer says.
+    pub fn forward(spec: &PolicySpec, flat: &[f32], layers: &[usize], mut h: Vec<f32>) -> (Self, Vec<f32>) {
+        let activation = match spec.config.activation {
+            Nonlinearity::Tanh => Activation::Tanh,
+            Nonlinearity::Relu => Activation::Relu,
+        };
+        let mut inputs = vec![];
+        for &layer in layers {
+            let mut next = dense(&spec.layers[layer], flat, &h);
+            activation.apply(&mut next);
+            inputs.push(std::mem::replace(&mut h, next));
+        }
+        (Self { inputs }, h)
+    }
+
+    /// From the gradient of the last layer's activations `out` to that of the first one's input.
+    pub fn backward(&self, spec: &PolicySpec, flat: &[f32], layers: &[usize], out: &[f32], mut d: Vec<f32>, grad: &mut [f32]) -> Vec<f32> {
+        for (i, &layer) in layers.iter().enumerate().rev() {
+            let layer = &spec.layers[layer];
+            let y = self.inputs.get(i + 1).map_or(out, Vec::as_slice);
+            match spec.config.activation {
+                Nonlinearity::Tanh => d.iter_mut().zip(y).for_each(|(d, y)| *d *= 1.0 - y * y),
+                Nonlinearity::Relu => d.iter_mut().zip(y).for_each(|(d, &y)| *d = if y > 0.0 { *d } else { 0.0 }),
+            }
+            dense_grad(layer, &d, &self.inputs[i], grad);
+            d = dense_back(layer, flat, &d);
+        }
+        d
+    }
+}
+
+/// Activations of an actor or critic: residual blocks or plain layers, then the output layer.
+pub(super) struct Head {
+    plain: Chain,
+    /// rows x W: the input of each block, then that of the output layer.
+    inputs: Vec<Vec<f32>>,
+    /// rows x W: both layers of each block, after the leaky ReLU.
+    inner: Vec<[Vec<f32>; 2]>,
+    pub out: Vec<f32>,
+}
+
+impl Head {
+    pub fn forward(spec: &PolicySpec, flat: &[f32], layers: &[usize], trunk: Vec<f32>) -> Self {
+        let (inner, last) = layers.split_at(layers.len() - 1);
+        let (blocks, plain) = if spec.config.hidden.is_empty() { (inner, &[][..]) } else { (&[][..], inner) };
+        let (plain, trunk) = Chain::forward(spec, flat, plain, trunk);
+        let (mut inputs, mut inner) = (vec![trunk], vec![]);
+        for pair in blocks.chunks_exact(2) {
+            let h = &inputs[inputs.len() - 1];
+            let first = leaky(dense(&spec.layers[pair[0]], flat, h));
+            let second = leaky(dense(&spec.layers[pair[1]], flat, &first));
+            let next = h.iter().zip(&second).map(|(h, s)| h + s).collect();
+            inputs.push(next);
+            inner.push([first, second]);
+        }
+        let out = dense(&spec.layers[last[0]], flat, &inputs[inputs.len() - 1]);
+        Self { plain, inputs, inner, out }
+    }
+
+    /// From the gradient of the output to that of the trunk.
+    pub fn backward(&self, spec: &PolicySpec, flat: &[f32], layers: &[usize], d: Vec<f32>, grad: &mut [f32]) -> Vec<f32> {
+        let (blocks, last) = layers.split_at(layers.len() - 1);
+        let last = &spec.layers[last[0]];
+        dense_grad(last, &d, &self.inputs[self.inputs.len() - 1], grad);
+        let mut d = dense_back(last, flat, &d);
+        for ((pair, h), [first, second]) in blocks.chunks_exact(2).zip(&self.inputs).zip(&self.inner).rev() {
+            let (a, b) = (&spec.layers[pair[0]], &spec.layers[pair[1]]);
+            let mut inner = d.clone();
+            leaky_back(second, &mut inner);
+            dense_grad(b, &inner, first, grad);
+            inner = dense_back(b, flat, &inner);
+            leaky_back(first, &mut inner);
+            dense_grad(a, &inner, h, grad);
+            product(rows_of(&inner, a.output), weight(a, flat), &mut d, a.input, true);
+        }
+        match spec.config.hidden.is_empty() {
+            true => d,
+            false => self.plain.backward(spec, flat, blocks, &self.inputs[0], d, grad),
+        }
+    }
+}
+
+fn leaky(mut x: Vec<f32>) -> Vec<f32> {
+    x.iter_mut().for_each(|v| *v = v.max(SLOPE * *v));
+    x
+}
+
+/// From gradients of the activations `y` to those of their inputs; y has the sign of its input.
+fn leaky_back(y: &[f32], d: &mut [f32]) {
+    d.iter_mut().zip(y).for_each(|(d, &y)| *d *= if y > 0.0 { 1.0 } else { SLOPE });
+}

@@ -1,7 +1,7 @@
 //! CMU motion in Biovision hierarchy (BVH) files.
 
-use super::cmu::{CMU_JOINTS, CMU_PARENTS, SourceClip, SourceFrame, cmu_joint, leg_length, rest_offset};
-use super::ik::arc;
+use super::cmu::{CMU_JOINTS, CMU_PARENTS, SourceClip, SourceFrame, alignments, cmu_joint, leg_length};
+use super::resample::check_fps;
 use crate::{Error, Result};
 use glam::{Quat, Vec3};
 use std::fs;
@@ -78,8 +78,12 @@ impl<'a> Words<'a> {
 /// its rest pose (some files rest with hanging arms); the root's path is scaled by the ratio of the leg lengths.
 pub fn read_bvh(path: impl AsRef<Path>, name: &str) -> Result<SourceClip> {
     let path = path.as_ref();
-    let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
-    let mut words = Words::new(path, &text);
+    parse_bvh(path, &fs::read_to_string(path).map_err(|e| Error::io(path, e))?, name)
+}
+
+/// [`read_bvh`] of the text of a file; `path` names it in errors.
+pub(super) fn parse_bvh(path: &Path, text: &str, name: &str) -> Result<SourceClip> {
+    let mut words = Words::new(path, text);
     words.word("HIERARCHY")?;
     words.word("ROOT")?;
     let mut joints = Vec::new();
@@ -94,19 +98,27 @@ pub fn read_bvh(path: impl AsRef<Path>, name: &str) -> Result<SourceClip> {
     if count == 0 || step <= 0.0 {
         return Err(Error::file(path, format!("has {count} frames of {step} s, expected more than none of each")));
     }
+    // Written frame times have few digits.
+    let fps = check_fps(path, "Frame Time", (1.0 / step).round())?;
     let leg = joints[cmu_joint::L_KNEE].offset.length() + joints[cmu_joint::L_ANKLE].offset.length();
     // Metres per file unit, so that the legs get the common skeleton's length.
     let scale = leg_length() / leg;
-    let align = alignments(&joints);
+    let align = alignments(|_, child| joints[child].offset);
+    if leg <= 0.0 {
+        return Err(Error::file(path, "the left leg has no length: its OFFSETs are 0"));
+    }
     let frames = (0..count).map(|_| parse_frame(&mut words, &joints, scale, &align)).collect::<Result<_>>()?;
     if words.next < words.words.len() {
         return Err(words.error(&format!("the end of the file after {count} frames")));
     }
-    Ok(SourceClip { name: name.to_string(), fps: (1.0 / step).round(), frames })
+    Ok(SourceClip { name: name.to_string(), fps, frames })
 }
 
 fn parse_joint(words: &mut Words, parent: usize, is_end: bool, joints: &mut Vec<Joint>) -> Result<()> {
     let index = joints.len();
+    if index == CMU_JOINTS {
+        return Err(words.error(&format!("no more than the {CMU_JOINTS} joints of the CMU skeleton, ends included")));
+    }
     words.next += 1; // The name, which differs between files.
     words.word("{")?;
     words.word("OFFSET")?;
@@ -158,18 +170,6 @@ fn check_topology(path: &Path, joints: &[Joint]) -> Result<()> {
         )),
         None => Ok(()),
     }
-}
-
-/// Per joint the rest rotation that turns the common skeleton's limb into the file's; hands go with their forearms.
-fn alignments(joints: &[Joint]) -> [Quat; CMU_JOINTS] {
-    let mut align = [Quat::IDENTITY; CMU_JOINTS];
-    for (j, child) in [(2, 3), (3, 4), (8, 9), (9, 10), (21, 22), (22, 23), (30, 31), (31, 32)] {
-        align[j] = arc(rest_offset(child), joints[child].offset);
-    }
-    let (left, right) = (align[22], align[31]);
-    align[23..29].fill(left);
-    align[32..].fill(right);
-    align
 }
 
 fn parse_frame(words: &mut Words, joints: &[Joint], scale: f32, align: &[Quat; CMU_JOINTS]) -> Result<SourceFrame> {

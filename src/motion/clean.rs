@@ -1,7 +1,7 @@
 //! Cleaning of recordings: false starts, ankles that jump, jitter.
 
 use super::clip::{Pose, quantile};
-use super::cmu::{SourceFrame, cmu_joint};
+use super::cmu::{SOURCE_FPS, SourceFrame, cmu_joint};
 use glam::{Quat, Vec3, Vec4};
 
 /// Frames cut off at both ends at 120 per second: some recordings begin with leftovers of the T-pose.
@@ -10,12 +10,14 @@ const TRIM: usize = 12;
 const MEDIAN: usize = 5;
 
 /// Trims both ends and takes jumps of some hundredths of a second out of the ankles by a running median.
-pub fn clean(frames: &[SourceFrame]) -> Vec<SourceFrame> {
-    let mut out = frames[TRIM.min(frames.len() / 4)..frames.len() - TRIM.min(frames.len() / 4)].to_vec();
+pub fn clean(frames: &[SourceFrame], fps: f32) -> Vec<SourceFrame> {
+    let at_rate = |frames: usize| (frames as f32 * fps / SOURCE_FPS).round() as usize;
+    let (trim, half) = (at_rate(TRIM).min(frames.len() / 4), at_rate(MEDIAN));
+    let mut out = frames[trim..frames.len() - trim].to_vec();
     for (knee, ankle) in [(cmu_joint::L_KNEE, cmu_joint::L_ANKLE), (cmu_joint::R_KNEE, cmu_joint::R_ANKLE)] {
         let local: Vec<Vec3> = out.iter().map(|f| short(f.rots[knee].inverse() * f.rots[ankle]).to_scaled_axis()).collect();
         for (t, frame) in out.iter_mut().enumerate() {
-            let window = &local[t.saturating_sub(MEDIAN)..(t + MEDIAN + 1).min(local.len())];
+            let window = &local[t.saturating_sub(half)..(t + half + 1).min(local.len())];
             let middle = |axis: usize| quantile(&window.iter().map(|v| v[axis]).collect::<Vec<_>>(), 0.5);
             let turn = Quat::from_scaled_axis(Vec3::new(middle(0), middle(1), middle(2)));
             frame.rots[ankle] = frame.rots[knee] * turn;
@@ -56,7 +58,7 @@ mod tests {
             SourceFrame { root: Vec3::ZERO, rots }
         };
         let frames: Vec<_> = (0..80).map(|t| frame(t, if (40..44).contains(&t) { 0.7 } else { 0.0 })).collect();
-        let out = clean(&frames);
+        let out = clean(&frames, SOURCE_FPS);
         assert_eq!(out.len(), 80 - 2 * TRIM);
         for (i, f) in out.iter().enumerate().skip(MEDIAN).take(80 - 2 * TRIM - 2 * MEDIAN) {
             let want = frame(i + TRIM, 0.0).rots[cmu_joint::L_ANKLE];

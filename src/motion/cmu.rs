@@ -2,6 +2,7 @@
 //!
 //! The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217.
 
+use super::ik::arc;
 use super::mend::mend_root;
 use crate::{Error, Result};
 use glam::{Quat, Vec3};
@@ -75,7 +76,27 @@ pub fn leg_length() -> f32 {
     rest_offset(cmu_joint::L_KNEE).length() + rest_offset(cmu_joint::L_ANKLE).length()
 }
 
+/// Per joint the rest rotation that turns the common skeleton's limb into a file's; hands go with their forearms.
+///
+/// `limb(joint, child)` is the file's rest vector from a joint to its child, in any unit.
+pub(super) fn alignments(limb: impl Fn(usize, usize) -> Vec3) -> [Quat; CMU_JOINTS] {
+    let mut align = [Quat::IDENTITY; CMU_JOINTS];
+    for (j, child) in [(2, 3), (3, 4), (8, 9), (9, 10), (21, 22), (22, 23), (30, 31), (31, 32)] {
+        align[j] = arc(rest_offset(child), limb(j, child));
+    }
+    let (left, right) = (align[22], align[31]);
+    align[23..29].fill(left);
+    align[32..].fill(right);
+    align
+}
+
 impl SourceFrame {
+    /// The frame `s` of the way (0..1) from this one to `next`: positions linearly, rotations along the shortest arc.
+    pub fn between(&self, next: &Self, s: f32) -> Self {
+        let rots = std::array::from_fn(|j| self.rots[j].slerp(next.rots[j], s));
+        Self { root: self.root.lerp(next.root, s), rots }
+    }
+
     /// Joint positions in the recording's world, metres.
     pub fn joints(&self) -> [Vec3; CMU_JOINTS] {
         let mut p = [self.root; CMU_JOINTS];
@@ -92,7 +113,11 @@ impl SourceFrame {
 /// The files hold rotations for row vectors, `G_j = R(e_j) G_parent`, so the rotation of column vectors is about `-e_j`.
 pub fn read_expmap(path: impl AsRef<Path>, name: &str) -> Result<SourceClip> {
     let path = path.as_ref();
-    let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    parse_expmap(path, &fs::read_to_string(path).map_err(|e| Error::io(path, e))?, name)
+}
+
+/// [`read_expmap`] of the text of a file; `path` names it in errors.
+pub(super) fn parse_expmap(path: &Path, text: &str, name: &str) -> Result<SourceClip> {
     let mut frames = Vec::new();
     for (i, line) in text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty()) {
         frames.push(frame_of_row(&parse_row(path, i + 1, line)?));

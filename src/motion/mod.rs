@@ -1,5 +1,6 @@
 //! Motion: clips, canonical primitives, the motion-primitive model.
 
+pub mod asf;
 pub mod augment;
 pub mod bvh;
 pub mod clean;
@@ -13,6 +14,7 @@ mod net;
 mod predictor;
 pub mod primitive;
 mod regressor;
+pub mod resample;
 pub mod retarget;
 mod weights;
 

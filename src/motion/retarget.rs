@@ -6,8 +6,9 @@ use super::clip::{Clip, Pose, SIDES, Skeleton, heading, quantile, speeds, uprigh
 use super::cmu::{SourceClip, SourceFrame, cmu_joint, leg_length, rest_offset};
 use super::footlock::{detect_contact, flat, lock_feet, slides};
 use super::ik::arc;
+use super::resample::resample;
+use crate::Result;
 use crate::body::BODY_JOINTS;
-use crate::{Error, Result};
 use glam::{Quat, Vec3};
 
 /// CMU joint whose rotation drives each body joint.
@@ -36,12 +37,7 @@ pub struct RetargetReport {
 
 /// Puts `source` on `skeleton` at 40 frames per second, on the floor, with locked feet.
 pub fn retarget(skeleton: &Skeleton, source: &SourceClip) -> Result<(Clip, RetargetReport)> {
-    let step = (source.fps / FPS).round() as usize;
-    if step == 0 || (source.fps - FPS * step as f32).abs() > 1.0 {
-        return Err(Error::invalid(format!("clip {}: {} frames per second, expected a multiple of {FPS}", source.name, source.fps)));
-    }
-    let cleaned = clean(&source.frames);
-    let frames: Vec<&SourceFrame> = cleaned.iter().step_by(step).collect();
+    let frames = resample(&source.name, &clean(&source.frames, source.fps), source.fps, SourceFrame::between)?;
     let align = alignments(skeleton);
     let scale = skeleton.leg_length(0) / leg_length();
     let poses = frames.iter().map(|f| map_frame(skeleton, f, &align, scale)).collect();
@@ -81,7 +77,7 @@ fn rest_hips(skeleton: &Skeleton) -> Vec3 {
     0.5 * (skeleton.rest[1] + skeleton.rest[2]) - skeleton.rest[0]
 }
 
-fn joint_error(skeleton: &Skeleton, clip: &Clip, frames: &[&SourceFrame], scale: f32) -> f32 {
+fn joint_error(skeleton: &Skeleton, clip: &Clip, frames: &[SourceFrame], scale: f32) -> f32 {
     let mut sum = 0.0;
     for (pose, frame) in clip.poses.iter().zip(frames) {
         let (ours, theirs) = (skeleton.joints(pose), frame.joints());

@@ -80,6 +80,14 @@ pub struct Clip {
     pub contact: Vec<[bool; SIDES]>,
 }
 
+impl Pose {
+    /// The pose `s` of the way (0..1) from this one to `next`: the root linearly, rotations along the shortest arc.
+    pub fn between(&self, next: &Self, s: f32) -> Self {
+        let rots = std::array::from_fn(|j| self.rots[j].slerp(next.rots[j], s));
+        Self { root: self.root.lerp(next.root, s), rots }
+    }
+}
+
 impl Skeleton {
     /// The skeleton of `model` with zero betas.
     pub fn new(model: &BodyModel) -> Self {
@@ -144,6 +152,11 @@ impl Skeleton {
         let leg = &self.legs[side];
         let toe_joint = foot.ankle + foot.rot * (self.rest[leg.toe] - self.rest[leg.ankle]);
         [foot.ankle + foot.rot * leg.heel, foot.ankle + foot.rot * leg.ball, toe_joint + foot.toe * leg.tip]
+    }
+
+    /// Height of the lowest point of both soles.
+    pub fn lowest(&self, pose: &Pose) -> f32 {
+        (0..SIDES).flat_map(|s| self.sole(s, &self.foot(pose, s))).map(|q| q.z).fold(f32::INFINITY, f32::min)
     }
 
     /// Body parameters of a pose (hands zero).

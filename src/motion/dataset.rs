@@ -142,7 +142,7 @@ fn retarget_report(reports: &[RetargetReport]) -> BuildReport {
         [quantile(&all, 0.5), quantile(&all, 0.9)]
     };
     BuildReport {
-        joint_error: reports.iter().map(|r| r.joint_error).sum::<f32>() / reports.len().max(1) as f32,
+        joint_error: reports.iter().filter_map(|r| r.joint_error).sum::<f32>() / reports.len().max(1) as f32,
         ground_shift: [quantile(&shifts, 0.0), quantile(&shifts, 1.0)],
         slide_before: slide(|r| &r.slide_before),
         slide_after: slide(|r| &r.slide_after),

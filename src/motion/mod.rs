@@ -1,24 +1,35 @@
 //! Motion: clips, canonical primitives, the motion-primitive model.
 
+pub mod amass;
 pub mod asf;
 pub mod augment;
 pub mod bvh;
+pub mod canonical;
 pub mod clean;
 pub mod clip;
 pub mod cmu;
 pub mod dataset;
 pub mod footlock;
+#[cfg(test)]
+mod fuzz;
 pub mod ik;
+mod import;
 mod mend;
 mod net;
+mod numpy;
+mod pickle;
+pub mod poses;
 mod predictor;
 pub mod primitive;
 mod regressor;
 pub mod resample;
 pub mod retarget;
+pub mod samp;
 mod weights;
+mod zip;
 
 pub use dataset::{BuildReport, build};
+pub use import::{ImportOptions, Recorded, import};
 pub use predictor::Predictor;
 pub use primitive::{ClipMarkers, MotionSet};
 pub use regressor::Regressor;

@@ -26,8 +26,9 @@ const FLAT_SPIN: f32 = 0.6;
 /// What retargeting did to one clip.
 #[derive(Clone, Debug, Default)]
 pub struct RetargetReport {
-    /// Mean distance of limb joints from the scaled source, metres, after removing the mean offset of each frame.
-    pub joint_error: f32,
+    /// Mean distance of limb joints from the scaled source, metres, after removing the mean offset of each frame; none where the
+    /// source holds rotations alone.
+    pub joint_error: Option<f32>,
     /// Height by which the clip was shifted to stand on the floor, metres.
     pub ground_shift: f32,
     /// Slide per stance before and after the foot lock, metres.
@@ -42,16 +43,21 @@ pub fn retarget(skeleton: &Skeleton, source: &SourceClip) -> Result<(Clip, Retar
     let scale = skeleton.leg_length(0) / leg_length();
     let poses = frames.iter().map(|f| map_frame(skeleton, f, &align, scale)).collect();
     let mut clip = Clip { name: source.name.clone(), poses, contact: vec![[false; SIDES]; frames.len()] };
-    let mut report = RetargetReport { joint_error: joint_error(skeleton, &clip, &frames, scale), ..Default::default() };
+    let mut report = RetargetReport { joint_error: Some(joint_error(skeleton, &clip, &frames, scale)), ..Default::default() };
     clip.poses = smooth(&clip.poses);
     level_posture(skeleton, &mut clip);
     level_feet(skeleton, &mut clip);
-    report.ground_shift = put_on_floor(skeleton, &mut clip);
-    detect_contact(skeleton, &mut clip);
-    report.slide_before = slides(skeleton, &clip);
-    lock_feet(skeleton, &mut clip);
-    report.slide_after = slides(skeleton, &clip);
+    settle(skeleton, &mut clip, &mut report);
     Ok((clip, report))
+}
+
+/// Puts `clip` on the floor, finds its stances and locks its feet in them.
+pub(super) fn settle(skeleton: &Skeleton, clip: &mut Clip, report: &mut RetargetReport) {
+    report.ground_shift = put_on_floor(skeleton, clip);
+    detect_contact(skeleton, clip);
+    report.slide_before = slides(skeleton, clip);
+    lock_feet(skeleton, clip);
+    report.slide_after = slides(skeleton, clip);
 }
 
 /// Per body joint the rest rotation that turns the body's bone into the source's bone.
@@ -138,11 +144,7 @@ fn still_frames(skeleton: &Skeleton, clip: &Clip, side: usize) -> Vec<usize> {
 
 /// Shifts the clip so that the 20 % quantile of its lowest sole points is the floor; returns the shift.
 fn put_on_floor(skeleton: &Skeleton, clip: &mut Clip) -> f32 {
-    let lowest: Vec<f32> = clip
-        .poses
-        .iter()
-        .map(|p| (0..SIDES).flat_map(|s| skeleton.sole(s, &skeleton.foot(p, s))).map(|q| q.z).fold(f32::INFINITY, f32::min))
-        .collect();
+    let lowest: Vec<f32> = clip.poses.iter().map(|p| skeleton.lowest(p)).collect();
     let shift = -quantile(&lowest, 0.2);
     clip.poses.iter_mut().for_each(|p| p.root.z += shift);
     shift

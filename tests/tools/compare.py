@@ -6,6 +6,7 @@ Usage: compare.py COMMITTED REMADE. Uses the standard library alone.
 import json
 import struct
 import sys
+import zipfile
 from pathlib import Path
 
 TOLERANCE = 1e-4
@@ -13,7 +14,7 @@ CODES = {"F32": "f", "F64": "d", "I32": "i", "I64": "q", "U8": "B", "BOOL": "?"}
 
 
 def arrays(path):
-    """Named flat lists of numbers of a safetensors or JSON file; the text of any other."""
+    """Named flat lists of numbers of a safetensors or JSON file; the bytes of an archive's entries or of any other file."""
     data = path.read_bytes()
     if path.suffix == ".safetensors":
         size = struct.unpack("<Q", data[:8])[0]
@@ -27,6 +28,10 @@ def arrays(path):
         flat = []
         flatten(json.loads(data), flat)
         yield "numbers", flat
+    elif path.suffix == ".npz":
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                yield name, archive.read(name)
     else:
         yield "text", data
 

@@ -154,7 +154,11 @@ fn refusals(mut env: Box<dyn VecEnv>, actions: &[f32]) {
     env.reset(SEED, &mut Vec::new()).expect("reset");
     let before = env.save_state().expect("save");
     let mut out = StepResult::default();
-    for bad in [f32::NAN, f32::INFINITY] {
+    let no_choice = match env.spec().action {
+        ActionSpace::Continuous(_) => vec![],
+        ActionSpace::Discrete(k) => vec![-1.0, 0.5, k as f32],
+    };
+    for bad in [f32::NAN, f32::INFINITY].into_iter().chain(no_choice) {
         let mut a = actions.to_vec();
         a[1] = bad;
         assert!(env.step(&a, &mut out).is_err(), "an action of {bad} is accepted");

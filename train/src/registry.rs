@@ -3,6 +3,7 @@
 use crate::{Error, Result};
 use egogen::sim::World;
 use egogen_envs::VecEnv;
+use egogen_envs::control::{Acrobot, CartPole, Control, Dynamics, MountainCar, MountainCarContinuous, Pendulum};
 use egogen_envs::motion::{MotionEnv, MotionTask};
 use egogen_envs::point::PointGoal;
 use serde::Deserialize;
@@ -40,13 +41,27 @@ impl Registry {
     pub fn standard() -> Self {
         let mut registry = Self::default();
         registry.add("motion", motion);
-        registry.add("point", |options, n, _| {
-            if let Some(key) = options.keys().next() {
-                return Err(Error::config(format!("env_options.{key}: the environment 'point' has no options")));
-            }
-            Ok(Made { env: Box::new(PointGoal::new(n, 0)), origin: BTreeMap::new() })
-        });
+        registry.add_plain("point", |n| Box::new(PointGoal::new(n, 0)));
+        registry.add_control::<CartPole>("cartpole");
+        registry.add_control::<Acrobot>("acrobot");
+        registry.add_control::<Pendulum>("pendulum");
+        registry.add_control::<MountainCar>("mountaincar");
+        registry.add_control::<MountainCarContinuous>("mountaincar_continuous");
         registry
+    }
+
+    /// Adds an environment without options that stands on nothing.
+    fn add_plain(&mut self, name: &'static str, make: impl Fn(usize) -> Box<dyn VecEnv> + Send + Sync + 'static) {
+        self.add(name, move |options, n, _| {
+            if let Some(key) = options.keys().next() {
+                return Err(Error::config(format!("env_options.{key}: the environment '{name}' has no options")));
+            }
+            Ok(Made { env: make(n), origin: BTreeMap::new() })
+        });
+    }
+
+    fn add_control<D: Dynamics + 'static>(&mut self, name: &'static str) {
+        self.add_plain(name, |n| Box::new(Control::<D>::new(n, 0)));
     }
 
     /// Adds (or replaces) an environment.
@@ -91,4 +106,21 @@ fn motion(options: &toml::Table, n: usize, purpose: Purpose) -> Result<Made> {
         Purpose::Test => MotionEnv::evaluation(options.task, sim, world.held_out, n, 0),
     };
     Ok(Made { env: Box::new(env?), origin })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reference_tasks_have_names_and_no_options() {
+        let registry = Registry::standard();
+        let none = toml::Table::new();
+        for (name, obs) in [("cartpole", 4), ("acrobot", 6), ("pendulum", 3), ("mountaincar", 2), ("mountaincar_continuous", 2)] {
+            let made = registry.make(name, &none, 3, Purpose::Train).unwrap();
+            assert_eq!((made.env.num_envs(), made.env.spec().obs_dim(), made.origin.len()), (3, obs, 0), "{name}");
+            let error = registry.make(name, &toml::toml! { gravity = 1.6 }, 3, Purpose::Train).err().unwrap().to_string();
+            assert!(error.contains("env_options.gravity") && error.contains(name), "{error}");
+        }
+    }
 }

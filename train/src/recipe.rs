@@ -7,10 +7,11 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// The recipes that come with the program: file stem and content.
-pub const EMBEDDED: [(&str, &str); 3] = [
+pub const EMBEDDED: [(&str, &str); 4] = [
     ("quick", include_str!("../recipes/quick.toml")),
     ("paper", include_str!("../recipes/paper.toml")),
     ("point", include_str!("../recipes/point.toml")),
+    ("pendulum", include_str!("../recipes/pendulum.toml")),
 ];
 
 /// A recipe as written.
@@ -242,4 +243,22 @@ pub fn of_run(dir: &Path, changes: &[String]) -> Result<Recipe> {
     let origin = path.display().to_string();
     let text = std::fs::read_to_string(&path).map_err(|e| Error::config(format!("{origin}: {e}: not a run folder")))?;
     Recipe::parse(&origin, &text, changes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::registry::{Purpose, Registry};
+
+    #[test]
+    fn every_recipe_of_a_reference_task_is_valid() {
+        let registry = Registry::standard();
+        for name in ["cartpole", "acrobot", "pendulum", "mountaincar", "mountaincar_continuous"] {
+            let path = format!("{}/recipes/{name}.toml", env!("CARGO_MANIFEST_DIR"));
+            let recipe = Recipe::load(&path, &[]).unwrap();
+            assert_eq!([&recipe.name, &recipe.env], [name; 2]);
+            registry.make(&recipe.env, &recipe.env_options, 1, Purpose::Train).unwrap();
+            recipe.plan().unwrap();
+        }
+    }
 }

@@ -23,6 +23,7 @@ fn policy() -> PolicySpec {
         activation: Default::default(),
         shared: false,
         log_std: None,
+        obs_norm: false,
         logvar: [-2.5, 2.5],
         actor_scale: Default::default(),
     };

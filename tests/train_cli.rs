@@ -88,6 +88,7 @@ fn schedules_and_normalisers_resume() {
     let options = [
         "adam.schedule={ adaptive = { target_kl = 0.02 } }",
         "ppo.reward_normalization=true",
+        "policy.obs_norm=true",
         "ppo.recompute_advantage=true",
         "ppo.value_clip=true",
         "ppo.dual_clip=2.0",

@@ -1,4 +1,5 @@
-//! The exported policy: a folder with `policy.json` and `policy.safetensors` (half precision).
+//! The exported policy: a folder with `policy.json` and `policy.safetensors` (half precision, or single
+//! where the policy normalises observations).
 //!
 //! The JSON names the observation layout, the sizes, the log-variance clamp, the hashes of what the policy stands on (motion model,
 //! body) and a golden pair: outputs for a fixed input, computed again whenever the bundle is read.
@@ -63,7 +64,7 @@ struct Golden {
 pub struct Bundle {
     /// Sizes and layers.
     pub spec: Arc<PolicySpec>,
-    /// Flat parameters, rounded to half precision.
+    /// Flat parameters, as the file holds them.
     pub params: Vec<f32>,
     /// Content hashes of what observations and actions stand on, e.g. "motion" and "body".
     pub origin: BTreeMap<String, String>,
@@ -73,9 +74,11 @@ pub struct Bundle {
 }
 
 impl Bundle {
-    /// Packs a policy; its parameters are rounded to half precision.
+    /// Packs a policy; its parameters are rounded to half precision, unless it normalises observations.
     pub fn new(spec: PolicySpec, params: &[f32], origin: BTreeMap<String, String>, trained: Trained) -> Result<Self> {
-        let bytes = pack_tensors(&spec.to_tensors(params), &BTreeMap::new(), Precision::Half)?;
+        // Means of observations may be far larger than their standard deviations.
+        let precision = if spec.obs_norm.is_some() { Precision::Full } else { Precision::Half };
+        let bytes = pack_tensors(&spec.to_tensors(params), &BTreeMap::new(), precision)?;
         let params = spec.from_tensors(&Tensors::from_bytes(WEIGHTS, bytes.clone())?)?;
         Ok(Self { spec: Arc::new(spec), params, origin, trained, bytes })
     }

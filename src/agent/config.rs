@@ -101,6 +101,9 @@ pub struct PolicyConfig {
     /// Start of a log standard deviation of actions that is a parameter of its own; absent: the network gives the log variance.
     #[serde(default)]
     pub log_std: Option<f32>,
+    /// Observations are brought to mean 0 and standard deviation 1, as far as training has seen them, and cut to +-10.
+    #[serde(default)]
+    pub obs_norm: bool,
     /// Range to which the log variance of actions is clamped.
     #[serde(default = "default_logvar")]
     pub logvar: [f32; 2],

@@ -29,6 +29,8 @@ impl PolicySpec {
             }
         }
         flat[self.log_std_range()].fill(self.config.log_std.unwrap_or(0.0));
+        let std = self.obs_norm_range().skip(self.layout.dim());
+        std.for_each(|i| flat[i] = 1.0);
         flat
     }
 

@@ -32,6 +32,8 @@ pub struct Network {
     layers: Vec<Layer>,
     /// (1, A)
     log_std: Option<Tensor<2>>,
+    /// Means and standard deviations of observations.
+    obs_norm: Vec<f32>,
     device: Device,
 }
 
@@ -48,8 +50,8 @@ impl Network {
             bias: Tensor::from_data(TensorData::new(d.bias_of(flat).to_vec(), [d.output]), &inner),
         };
         let log_std = || Tensor::from_data(TensorData::new(flat[spec.log_std_range()].to_vec(), [1, spec.action.count()]), &inner);
-        let log_std = spec.log_std.map(|_| log_std());
-        let network = Self { spec: spec.clone(), layers: spec.layers.iter().map(layer).collect(), log_std, device: inner };
+        let (log_std, obs_norm) = (spec.log_std.map(|_| log_std()), flat[spec.obs_norm_range()].to_vec());
+        let network = Self { spec: spec.clone(), layers: spec.layers.iter().map(layer).collect(), log_std, obs_norm, device: inner };
         if device.is_autodiff() { network.with_gradients() } else { network }
     }
 
@@ -60,6 +62,7 @@ impl Network {
             spec: self.spec.clone(),
             layers: self.layers.iter().map(leaf).collect(),
             log_std: self.log_std.clone().map(|s| s.autodiff().require_grad()),
+            obs_norm: self.obs_norm.clone(),
             device: self.device.clone().autodiff(),
         }
     }
@@ -118,6 +121,7 @@ impl Network {
     fn trunk(&self, obs: &[f32]) -> Tensor<2> {
         let dim = self.spec.layout.dim();
         let rows = obs.len() / dim;
+        let obs = &*self.spec.normalised(&self.obs_norm, obs);
         let mut parts = Vec::with_capacity(self.spec.encoders.len());
         for encoder in &self.spec.encoders {
             let group = |width: usize, frame: usize| {

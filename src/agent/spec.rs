@@ -13,6 +13,7 @@
 //! | | (K, W), (K) | logits of K discrete actions |
 //! | `critic.<b>.<0 or 1>` or `critic.<i>`, `critic.out` | (W, W), (1, W) | |
 //! | `actor.log_std` | (A) | log standard deviation before the clamp, with [`PolicyConfig::log_std`] |
+//! | `obs.mean`, `obs.std` | (D), (D) | of all observations seen, with [`PolicyConfig::obs_norm`]; not learned by gradients |
 //!
 //! Layouts are torch's: `weight` is (out, in) row-major, y = W x + b.
 
@@ -20,11 +21,16 @@ use super::config::check;
 use super::{ActionSpace, ObsGroup, ObsLayout, PolicyConfig};
 use crate::io::Tensors;
 use crate::{Error, Result};
+use std::borrow::Cow;
 
 /// Scalar groups are encoded; this is their width.
 const SCALAR: usize = 1;
 /// Tensor name of [`PolicySpec::log_std`].
 const LOG_STD: &str = "actor.log_std";
+/// Tensor names of [`PolicySpec::obs_norm`].
+const OBS_NORM: [&str; 2] = ["obs.mean", "obs.std"];
+/// Normalised observations are cut to plus and minus this.
+const OBS_MAX: f32 = 10.0;
 
 /// Where a layer's weights lie in the flat parameter vector; the bias follows the weight.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -98,6 +104,8 @@ pub struct PolicySpec {
     pub critic: Vec<usize>,
     /// First float of the log standard deviation that is a parameter.
     pub log_std: Option<usize>,
+    /// First float of the observations' means and standard deviations, which lie behind all that is learned.
+    pub obs_norm: Option<usize>,
 }
 
 impl PolicySpec {
@@ -105,9 +113,9 @@ impl PolicySpec {
     pub fn new(config: PolicyConfig, layout: ObsLayout, action: impl Into<ActionSpace>) -> Result<Self> {
         let action = action.into();
         check(&config, &layout, action)?;
-        let (encoders, layers, project, log_std) = (vec![], vec![], None, None);
+        let (encoders, layers, project, log_std, obs_norm) = (vec![], vec![], None, None, None);
         let (shared, actor, critic) = (vec![], vec![], vec![]);
-        let mut spec = Self { config, layout, action, encoders, layers, project, shared, actor, critic, log_std };
+        let mut spec = Self { config, layout, action, encoders, layers, project, shared, actor, critic, log_std, obs_norm };
         let mut start = 0;
         for group in spec.layout.groups.clone() {
             let encoder = spec.encoder(&group, start);
@@ -125,6 +133,7 @@ impl PolicySpec {
         spec.actor = spec.head("actor", trunk, spec.outputs());
         spec.critic = spec.head("critic", trunk, 1);
         spec.log_std = spec.config.log_std.map(|_| spec.params());
+        spec.obs_norm = spec.config.obs_norm.then(|| spec.params());
         Ok(spec)
     }
 
@@ -141,6 +150,26 @@ impl PolicySpec {
         self.log_std.map_or(0..0, |at| at..at + self.action.count())
     }
 
+    /// Floats that gradients move; they come first.
+    pub fn learned(&self) -> usize {
+        self.obs_norm.unwrap_or(self.params())
+    }
+
+    /// Where means and then standard deviations of the observations lie; empty where there are none.
+    pub fn obs_norm_range(&self) -> std::ops::Range<usize> {
+        self.obs_norm.map_or(0..0, |at| at..at + 2 * self.layout.dim())
+    }
+
+    /// Observation rows as the network gets them; `norm` is what lies at [`PolicySpec::obs_norm_range`].
+    pub fn normalised<'a>(&self, norm: &[f32], obs: &'a [f32]) -> Cow<'a, [f32]> {
+        if norm.is_empty() {
+            return Cow::Borrowed(obs);
+        }
+        let (mean, std) = norm.split_at(norm.len() / 2);
+        let row = |row: &'a [f32]| row.iter().zip(mean).zip(std).map(|((x, m), s)| ((x - m) / s).clamp(-OBS_MAX, OBS_MAX));
+        Cow::Owned(obs.chunks_exact(mean.len()).flat_map(row).collect())
+    }
+
     /// The clamped log variances that do not depend on the observation; empty where they do.
     pub fn free_logvar(&self, flat: &[f32]) -> Vec<f32> {
         let [low, high] = self.config.logvar;
@@ -149,7 +178,7 @@ impl PolicySpec {
 
     /// Floats of all parameters.
     pub fn params(&self) -> usize {
-        self.layers.iter().map(Dense::params).sum::<usize>() + self.log_std_range().len()
+        self.layers.iter().map(Dense::params).sum::<usize>() + self.log_std_range().len() + self.obs_norm_range().len()
     }
 
     /// Width of the concatenated encodings.
@@ -166,7 +195,9 @@ impl PolicySpec {
             ]
         };
         let log_std = self.log_std.map(|_| (LOG_STD.to_string(), vec![self.action.count()], flat[self.log_std_range()].to_vec()));
-        self.layers.iter().flat_map(named).chain(log_std).collect()
+        let norm = flat[self.obs_norm_range()].chunks(self.layout.dim()).zip(OBS_NORM);
+        let norm = norm.map(|(v, name)| (name.to_string(), vec![v.len()], v.to_vec()));
+        self.layers.iter().flat_map(named).chain(log_std).chain(norm).collect()
     }
 
     /// The flat vector from named tensors of exactly these layers.
@@ -179,8 +210,11 @@ impl PolicySpec {
         if self.log_std.is_some() {
             flat.extend(tensors.f32s(LOG_STD, &[self.action.count()])?);
         }
-        let known =
-            |name: &String| (self.log_std.is_some() && name == LOG_STD) || self.layers.iter().any(|d| d.weight == *name || d.bias == *name);
+        let extras: Vec<&str> = self.log_std.map(|_| LOG_STD).into_iter().chain(self.obs_norm.iter().flat_map(|_| OBS_NORM)).collect();
+        for name in self.obs_norm.iter().flat_map(|_| OBS_NORM) {
+            flat.extend(tensors.f32s(name, &[self.layout.dim()])?);
+        }
+        let known = |name: &String| extras.contains(&name.as_str()) || self.layers.iter().any(|d| d.weight == *name || d.bias == *name);
         match tensors.names().into_iter().find(|n| !known(n)) {
             Some(name) => Err(Error::file(tensors.origin(), format!("tensor '{name}' has no place in this policy"))),
             None => Ok(flat),

@@ -25,6 +25,8 @@ pub struct PolicyEngine {
     stem: Vec<(Linear, Activation)>,
     /// Log variances that do not depend on the observation.
     logvar: Vec<f32>,
+    /// Means and standard deviations of observations.
+    obs_norm: Vec<f32>,
     actor: Head,
     critic: Head,
     pool: Pool,
@@ -64,6 +66,7 @@ impl PolicyEngine {
             cells: spec.encoders.iter().filter_map(cell).collect::<Result<_>>()?,
             stem: project.into_iter().chain(spec.shared.iter().map(plain)).collect::<Result<_>>()?,
             logvar: spec.free_logvar(flat),
+            obs_norm: flat[spec.obs_norm_range()].to_vec(),
             actor: head(&spec.actor)?,
             critic: head(&spec.critic)?,
             pool: Pool::default(),
@@ -114,6 +117,7 @@ impl PolicyEngine {
         let people = obs.len() / dim;
         check("the observations", obs.len(), people * dim)?;
         check("the policy's output", out.len(), people * width)?;
+        let obs = &*self.spec.normalised(&self.obs_norm, obs);
         let encoded = self.spec.encoded();
         let trunk = self.stem.last().map_or(encoded, |(layer, _)| layer.outputs());
         let wide = self.stem.iter().fold(encoded, |w, (layer, _)| w.max(layer.outputs()));
@@ -244,7 +248,7 @@ mod tests {
         let make = |config: serde_json::Value, action: ActionSpace| {
             PolicySpec::new(serde_json::from_value(config).unwrap(), layout.clone(), action).unwrap()
         };
-        let free = serde_json::json!({"octaves": 2, "hidden": [9, 40, 5], "log_std": -0.05, "logvar": [-0.2, 0.3]});
+        let free = serde_json::json!({"octaves": 2, "hidden": [9, 40, 5], "log_std": -0.05, "logvar": [-0.2, 0.3], "obs_norm": true});
         let logvar = compare(&make(free, ActionSpace::Continuous(3)));
         assert_eq!(logvar.len(), 29 * 3);
         let shared = serde_json::json!({"octaves": 2, "trunk": 6, "hidden": [20, 11], "activation": "relu", "shared": true});

@@ -134,7 +134,7 @@ impl Checkpoint {
         let state: State = postcard::from_bytes(&checked(STATE)?).map_err(|e| egogen::Error::file(dir.join(STATE), e.to_string()))?;
         let params = spec.from_tensors(&Tensors::from_bytes(dir.join(MODEL), checked(MODEL)?)?)?;
         let moments = Tensors::from_bytes(dir.join(OPTIMIZER), checked(OPTIMIZER)?)?;
-        let size = [params.len()];
+        let size = [spec.learned()];
         let adam = AdamW { steps: state.adam_steps, first: moments.f32s("first", &size)?, second: moments.f32s("second", &size)? };
         Ok(Self { description, params, adam, state })
     }

@@ -8,7 +8,7 @@ use crate::policy::{Compute, Policy};
 use crate::running::Running;
 use crate::shards::Shards;
 use crate::{Error, Result};
-use egogen::agent::PolicySpec;
+use egogen::agent::{Part, PolicySpec};
 use egogen::rng::stream;
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
@@ -111,7 +111,7 @@ pub struct Rules<'a> {
 }
 
 /// What learning carries from update to update beside parameters and moments.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Progress {
     /// Updates done.
     pub updates: u64,
@@ -119,6 +119,8 @@ pub struct Progress {
     pub learning_rate: Option<f32>,
     /// Returns so far, for `reward_normalization`.
     pub returns: Running,
+    /// Every float of the observations so far, for `policy.obs_norm`; empty without.
+    pub obs: Vec<Running>,
 }
 
 /// What the steps of a rollout are to teach; values and returns on the critic's scale.
@@ -198,12 +200,8 @@ impl Learner {
                     lr = rules.adam.schedule.adapt(lr, losses.approx_kl);
                 }
                 stats.losses.add(&losses, 1.0 / batches as f64);
-                self.adam.step(
-                    &AdamConfig { lr, ..*rules.adam },
-                    &mut self.params,
-                    &grads,
-                    clip_scale(losses.grad_norm as f32, ppo.max_grad_norm),
-                );
+                let (learned, scale) = (self.spec.learned(), clip_scale(losses.grad_norm as f32, ppo.max_grad_norm));
+                self.adam.step(&AdamConfig { lr, ..*rules.adam }, &mut self.params[..learned], &grads[..learned], scale);
                 steps += 1;
             }
         }
@@ -213,8 +211,31 @@ impl Learner {
         (stats.learning_rate, stats.gradient_steps) = (f64::from(lr), steps as f64);
         self.progress.learning_rate = Some(lr);
         self.progress.updates += 1;
+        self.observe(&rollout.obs);
         self.policy = Policy::new(&self.spec, &self.params, &self.compute)?;
         Ok(stats)
+    }
+
+    /// Counts observations towards their means and standard deviations, which the policy uses from the next collection on. Scalars
+    /// that are encoded by waves stay as they are.
+    fn observe(&mut self, obs: &[f32]) {
+        let dim = self.spec.layout.dim();
+        if self.spec.obs_norm.is_none() || obs.is_empty() {
+            return;
+        }
+        self.progress.obs.resize(dim, Running::default());
+        let (mean, std) = self.params[self.spec.obs_norm_range()].split_at_mut(dim);
+        for encoder in self.spec.encoders.iter().filter(|e| e.part != Part::Sine) {
+            let width = match encoder.part {
+                Part::Gru { frames, width, .. } => frames * width,
+                _ => encoder.output,
+            };
+            for k in encoder.start..encoder.start + width {
+                let seen = &mut self.progress.obs[k];
+                seen.add(obs[k..].iter().step_by(dim).copied());
+                (mean[k], std[k]) = (seen.mean as f32, (seen.variance + f64::from(f32::EPSILON)).sqrt() as f32);
+            }
+        }
     }
 
     /// Advantages and returns from values on the critic's scale; the returns then count towards its scale.
@@ -275,7 +296,7 @@ fn explained_variance(returns: &[f32], values: &[f32]) -> f64 {
 mod tests {
     use super::*;
     use crate::Collector;
-    use egogen::agent::ObsLayout;
+    use egogen::agent::{ObsGroup, ObsLayout};
     use egogen_envs::VecEnv;
     use egogen_envs::point::PointGoal;
 
@@ -318,6 +339,25 @@ mod tests {
                 assert!((have - want).abs() < 1e-4 * want.abs().max(1.0), "collection {c}: {have} against {want}");
             }
         }
+    }
+
+    /// Three batches through Tianshou's `RunningMeanStd`, then some rows normalised, far ones among them.
+    #[test]
+    fn observations_are_normalised_as_in_tianshou() {
+        let t = crate::fixture();
+        let layout = ObsLayout::new(vec![ObsGroup { name: "a".into(), shape: vec![3] }, ObsGroup { name: "b".into(), shape: vec![2] }]);
+        let config = r#"{"hidden": [4], "obs_norm": true}"#;
+        let spec = PolicySpec::new(serde_json::from_str(config).unwrap(), layout, 2).unwrap();
+        let (params, adam) = (spec.init(1), AdamW::new(spec.learned()));
+        let mut learner = Learner::new(spec, Compute::Own, Shards::new(1, 1).unwrap(), params, adam, Progress::default()).unwrap();
+        for batch in ["0", "1", "2"] {
+            let name = format!("obs.{batch}");
+            learner.observe(&t.f32s(&name, &t.shape(&name).unwrap()).unwrap());
+        }
+        let (probe, want) = (t.f32s("obs.probe", &[6, 5]).unwrap(), t.f32s("obs.normalised", &[6, 5]).unwrap());
+        let have = learner.spec.normalised(&learner.params[learner.spec.obs_norm_range()], &probe);
+        assert!(have.iter().zip(&want).all(|(h, w)| (h - w).abs() < 2e-5 * w.abs().max(1.0)), "{have:?} against {want:?}");
+        assert!(want.contains(&10.0) && want.contains(&-10.0), "the cut is tested");
     }
 
     #[test]

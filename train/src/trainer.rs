@@ -82,7 +82,7 @@ impl Trainer {
         check_best(&recipe.checkpoint.best, &env_spec)?;
         let mut collector = Collector::new(made.env, recipe.seed)?;
         let (params, adam, state) = match from {
-            None => (spec.init(recipe.seed), AdamW::new(spec.params()), State::default()),
+            None => (spec.init(recipe.seed), AdamW::new(spec.learned()), State::default()),
             Some(c) => {
                 check_same(&c.description, &spec, &made.origin)?;
                 collector.load(&c.state.collector)?;
@@ -221,7 +221,7 @@ impl Trainer {
                 adam_steps: self.learner.adam().steps,
                 best: self.best.clone(),
                 last_test: self.last_test.clone(),
-                learning: *self.learner.progress(),
+                learning: self.learner.progress().clone(),
                 stats: self.stats.clone(),
                 collector: self.collector.save()?,
             },

@@ -9,6 +9,7 @@ import torch
 from safetensors.numpy import save_file
 from tianshou.data import Batch, ReplayBuffer
 from tianshou.policy import BasePolicy, PPOPolicy
+from tianshou.utils import RunningMeanStd
 from torch.distributions import Categorical, Independent, Normal, kl_divergence
 
 OUT = {}
@@ -267,6 +268,18 @@ def orthogonal(draws=4000, rows=6, columns=9):
     put("orthogonal.moments", [w.mean(), w.pow(2).mean(), w.pow(4).mean(), w.diagonal(dim1=1, dim2=2).mean()])
 
 
+def observations():
+    """Batches through Tianshou's running mean and standard deviation, then rows normalised, far ones among them."""
+    rms, scale = RunningMeanStd(), np.array([1, 20, 0.1, 3, 1])
+    for i, rows in enumerate([4, 1, 9]):
+        batch = (rng.normal(size=(rows, 5)) * scale + [0, 50, -1, i, 0]).astype(np.float32)
+        rms.update(batch)
+        put(f"obs.{i}", batch)
+    probe = (rng.normal(size=(6, 5)) * scale * 8).astype(np.float32)
+    put("obs.probe", probe)
+    put("obs.normalised", rms.norm(probe))
+
+
 VARIANTS = {
     "plain": {},
     "dual": dict(dual_clip=1.3),
@@ -290,4 +303,5 @@ choices = lambda net, logits: Categorical(logits=logits)
 small("choice", Small(4, activation=torch.relu, shared=True), choices, torch.randint(4, (13,)))
 distributions()
 orthogonal()
+observations()
 save_file(OUT, Path(__file__).parents[2] / "fixtures" / "ppo.safetensors")

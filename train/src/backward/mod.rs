@@ -29,6 +29,7 @@ impl<'a> Tape<'a> {
     pub fn forward(spec: &'a PolicySpec, flat: &'a [f32], obs: &[f32]) -> Self {
         let (dim, width) = (spec.layout.dim(), spec.encoded());
         let rows = obs.len() / dim;
+        let obs = &*spec.normalised(&flat[spec.obs_norm_range()], obs);
         let mut encoded = vec![0.0; rows * width];
         let (mut grus, mut at) = (vec![], 0);
         for encoder in &spec.encoders {

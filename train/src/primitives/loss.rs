@@ -12,7 +12,8 @@ use serde::{Deserialize, Serialize};
 pub struct LossWeights {
     /// Mean absolute error of the frame differences, the step from the seed included (A2: 3).
     pub velocity: f32,
-    /// Divergence from the prior (A2: 1; that keeps 3 useful dimensions of 128, this 70 to 110).
+    /// Divergence from the prior (A2: 1). Smaller weights reconstruct better, but then samples of the prior cover less of what
+    /// people do: see the results page.
     pub kl: f32,
     /// Use sqrt(1 + KL^2) - 1 (A2) instead of KL.
     pub robust: bool,
@@ -25,7 +26,7 @@ pub struct LossWeights {
 
 impl Default for LossWeights {
     fn default() -> Self {
-        Self { velocity: 3.0, kl: 0.03, robust: true, skate: 2.0, contact: 1.0 }
+        Self { velocity: 3.0, kl: 0.3, robust: true, skate: 2.0, contact: 1.0 }
     }
 }
 

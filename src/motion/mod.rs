@@ -14,10 +14,12 @@ pub mod footlock;
 mod fuzz;
 pub mod ik;
 mod import;
+mod layers;
 mod mend;
 mod net;
 mod numpy;
 mod pickle;
+pub mod pose_prior;
 pub mod poses;
 mod predictor;
 pub mod primitive;
@@ -30,12 +32,14 @@ mod zip;
 
 pub use dataset::{BuildReport, build};
 pub use import::{ImportOptions, Recorded, import};
+pub use layers::{Dense, Gru, Named, Parameters};
+pub use pose_prior::PosePrior;
 pub use predictor::Predictor;
 pub use primitive::{ClipMarkers, MotionSet};
 pub use regressor::Regressor;
 pub use weights::{
-    CONFIG_FILE, CONTINUOUS, Dense, Gru, MotionConfig, MotionWeights, Named, PREDICTOR_FILE, Parameters, PredictorSizes, PredictorWeights,
-    REGRESSOR_FILE, RegressorSizes, RegressorWeights,
+    CONFIG_FILE, CONTINUOUS, MotionConfig, MotionWeights, PREDICTOR_FILE, PredictorSizes, PredictorWeights, REGRESSOR_FILE, RegressorSizes,
+    RegressorWeights,
 };
 
 use crate::Result;

@@ -3,6 +3,7 @@
 use egogen::scene::SparseScenes;
 use egogen::{Error, Result};
 use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
 
 /// Weights of the reward terms: Tab. S2, with the authors' 0.1 for the sparse penetration term, which the table leaves open.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -13,6 +14,8 @@ pub struct Weights {
     pub dist: f32,
     pub orient: f32,
     pub attention: f32,
+    /// The pose prior is only asked when this is not 0: it takes about a tenth of a step's time.
+    pub pose: f32,
     pub penetration: f32,
     pub success: f32,
     /// Not in the paper (0 there): paid on success for every step left. Each step alive pays about 0.5, so without this a
@@ -22,8 +25,18 @@ pub struct Weights {
 
 impl Default for Weights {
     fn default() -> Self {
-        Self { floor: 0.1, skate: 0.3, dist: 1.0, orient: 0.1, attention: 0.3, penetration: 0.1, success: 0.5, arrival: 0.0 }
+        Self { floor: 0.1, skate: 0.3, dist: 1.0, orient: 0.1, attention: 0.3, pose: 0.1, penetration: 0.1, success: 0.5, arrival: 0.0 }
     }
+}
+
+/// What judges poses (eq. 9).
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PoseCheck {
+    /// A pose prior of VPoser's form (see `egogen::motion::pose_prior`); absent: the shipped one.
+    pub prior: Option<PathBuf>,
+    /// ||VP|| below which a pose is natural; absent: the one in the prior's file, or 11, which is the paper's for VPoser v1.
+    pub threshold: Option<f32>,
 }
 
 /// The task of walking to a goal in a sparse scene. Defaults are the paper's.
@@ -33,6 +46,7 @@ pub struct MotionTask {
     /// How scenes, starts and goals are drawn.
     pub scene: SparseScenes,
     pub weights: Weights,
+    pub pose: PoseCheck,
     /// Steps (of 0.45 s) after which an episode ends. The observation shows the time, so this is a termination.
     pub max_depth: u32,
     /// People start facing the goal but for a turn of up to this, degrees either way.
@@ -50,6 +64,7 @@ impl Default for MotionTask {
         Self {
             scene: SparseScenes::default(),
             weights: Weights::default(),
+            pose: PoseCheck::default(),
             max_depth: 11,
             yaw_noise_deg: 36.0,
             success_distance: 0.1,
@@ -70,6 +85,7 @@ impl MotionTask {
             let weight = (term.weight)(&self.weights);
             need(weight.is_finite(), &format!("weights.{}", term.name), "a finite number")?;
         }
+        need(self.pose.threshold.is_none_or(|t| t > 0.0 && t.is_finite()), "pose.threshold", "more than 0")?;
         need((1..=1000).contains(&self.max_depth), "max_depth", "1 to 1000 steps")?;
         need((0.0..=180.0).contains(&self.yaw_noise_deg), "yaw_noise_deg", "0 to 180 degrees")?;
         need(self.success_distance > 0.0 && self.success_distance <= 1.0, "success_distance", "more than 0, at most 1 m")?;
@@ -100,6 +116,7 @@ mod tests {
             (r#"{"blocked_cells": 0}"#, "blocked_cells"),
             (r#"{"cell": 0.0}"#, "cell"),
             (r#"{"weights": {"skate": 1e39}}"#, "weights.skate"),
+            (r#"{"pose": {"threshold": 0.0}}"#, "pose.threshold"),
             (r#"{"scene": {"side": [2.0, 1.0]}}"#, "scene.side"),
         ] {
             let task: MotionTask = serde_json::from_str(text).unwrap();

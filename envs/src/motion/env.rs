@@ -1,9 +1,10 @@
 //! The vectorised environment of the motion task.
 
-use super::member::{Member, OBS, STATE, blocked};
+use super::member::{Member, OBS, STATE, Step, blocked};
 use super::{EPISODE, MotionTask, TERMS};
 use crate::{ActionSpace, EnvError, EnvSpec, ObsGroup, StepResult, VecEnv};
-use egogen::motion::SEED;
+use egogen::body::PARAMS;
+use egogen::motion::{FRAMES, PosePrior, SEED};
 use egogen::rng::stream;
 use egogen::scene::Setting;
 use egogen::sensing::RAYS;
@@ -37,8 +38,36 @@ pub struct MotionEnv {
     starts: Starts,
     sim: Arc<Sim>,
     bank: Arc<SeedBank>,
+    /// Judges poses; none when eq. 9 has no weight.
+    judge: Option<PoseJudge>,
     state: State,
     prims: Primitives,
+}
+
+/// A pose prior with a threshold (eq. 9).
+struct PoseJudge {
+    prior: Arc<PosePrior>,
+    threshold: f32,
+}
+
+impl PoseJudge {
+    fn new(task: &MotionTask) -> Result<Option<Self>, EnvError> {
+        if task.weights.pose == 0.0 {
+            return Ok(None);
+        }
+        let prior = match &task.pose.prior {
+            Some(path) => Arc::new(PosePrior::load(path)?),
+            None => PosePrior::embedded()?,
+        };
+        let threshold = task.pose.threshold.unwrap_or(prior.threshold());
+        Ok(Some(Self { prior, threshold }))
+    }
+
+    /// Whether the mean ||VP|| over the primitive of person `i` is below the threshold.
+    fn natural(&self, prims: &Primitives, i: usize) -> bool {
+        let norms = self.prior.norms(&prims.params[i * FRAMES * PARAMS..][..FRAMES * PARAMS]);
+        norms.iter().sum::<f32>() / (FRAMES as f32) < self.threshold
+    }
 }
 
 /// Fewest people that one task works on.
@@ -71,7 +100,8 @@ impl MotionEnv {
         }
         let spec = spec(sim.model().latent_dim());
         let state = State { seed, people: People::new(n), members: vec![Member::default(); n] };
-        let mut env = Self { spec, task, starts, sim, bank, state, prims: Primitives::default() };
+        let judge = PoseJudge::new(&task)?;
+        let mut env = Self { spec, task, starts, sim, bank, judge, state, prims: Primitives::default() };
         env.restart(seed)?;
         Ok(env)
     }
@@ -152,11 +182,12 @@ impl MotionEnv {
     /// Judges everyone after a step; returns who ended.
     fn judge(&mut self, out: &mut StepResult) -> Result<Vec<usize>, EnvError> {
         let State { people, members, .. } = &mut self.state;
-        let (task, prims, people) = (&self.task, &self.prims, &*people);
+        let (task, prims, people, judge) = (&self.task, &self.prims, &*people, &self.judge);
         let (terms, figures) = (out.info.par_chunks_exact_mut(TERMS.len()), out.episode.par_chunks_exact_mut(EPISODE.len()));
         let each = (members, terms, figures, &mut out.reward, &mut out.terminated).into_par_iter().with_min_len(CHUNK);
         each.enumerate().for_each(|(i, (member, terms, episode, reward, ended))| {
-            let verdict = member.judge(task, people, prims, i, terms, episode);
+            let natural = judge.as_ref().is_none_or(|j| j.natural(prims, i));
+            let verdict = member.judge(task, &Step { people, prims, person: i, natural }, terms, episode);
             (*reward, *ended) = (verdict.reward, verdict.ended);
         });
         if let Some(i) = out.reward.iter().position(|r| !r.is_finite()) {

@@ -34,6 +34,15 @@ pub(super) struct Member {
     near_steps: u32,
 }
 
+/// A step that a person made.
+pub(super) struct Step<'a> {
+    pub people: &'a People,
+    pub prims: &'a Primitives,
+    pub person: usize,
+    /// Its poses were natural.
+    pub natural: bool,
+}
+
 /// What a step brought.
 pub(super) struct Verdict {
     pub reward: f32,
@@ -68,13 +77,11 @@ impl Member {
         scalars[1] = 1.0 - self.steps as f32 / task.max_depth as f32;
     }
 
-    /// Judges the step that person `i` just made; writes the weighted reward terms and, at an end, the episode's figures.
+    /// Judges the step just made; writes the weighted reward terms and, at an end, the episode's figures.
     pub fn judge(
         &mut self,
         task: &MotionTask,
-        people: &People,
-        prims: &Primitives,
-        i: usize,
+        &Step { people, prims, person: i, natural }: &Step,
         terms: &mut [f32],
         episode: &mut [f32],
     ) -> Verdict {
@@ -92,6 +99,7 @@ impl Member {
             goal,
             dist_before: self.dist,
             dist,
+            natural,
             arrived: dist < task.success_distance,
             penetrates: blocked(task, people, i, &self.setting.scene.walkable) >= task.blocked_cells,
             left: task.max_depth - self.steps,

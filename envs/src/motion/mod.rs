@@ -9,7 +9,7 @@ mod tests;
 #[cfg(test)]
 mod toy;
 
-pub use config::{MotionTask, Weights};
+pub use config::{MotionTask, PoseCheck, Weights};
 pub use env::{MotionEnv, Starts};
 pub use member::blocked;
 pub use rewards::{Outcome, TERMS, Term};

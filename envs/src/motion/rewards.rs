@@ -21,6 +21,8 @@ pub struct Outcome<'a> {
     pub dist_before: f32,
     /// Distance from pelvis to goal, metres.
     pub dist: f32,
+    /// Mean ||VP|| of the 20 frames' poses is below the task's threshold.
+    pub natural: bool,
     /// Nearer than the task's success distance.
     pub arrived: bool,
     /// The body's box holds as many non-walkable cells as the task forbids.
@@ -40,12 +42,13 @@ pub struct Term {
 }
 
 /// All terms; the reward of a step is their weighted sum.
-pub const TERMS: [Term; 8] = [
+pub const TERMS: [Term; 9] = [
     Term { name: "floor", value: floor, weight: |w| w.floor },
     Term { name: "skate", value: skate, weight: |w| w.skate },
     Term { name: "dist", value: dist, weight: |w| w.dist },
     Term { name: "orient", value: orient, weight: |w| w.orient },
     Term { name: "attention", value: attention, weight: |w| w.attention },
+    Term { name: "pose", value: pose, weight: |w| w.pose },
     Term { name: "penetration", value: penetration, weight: |w| w.penetration },
     Term { name: "success", value: success, weight: |w| w.success },
     Term { name: "arrival", value: arrival, weight: |w| w.arrival },
@@ -75,6 +78,11 @@ fn orient(o: &Outcome) -> f32 {
 /// Eq. 1: whether the head looks at the goal, in space; 0 to 1.
 fn attention(o: &Outcome) -> f32 {
     (o.view.dot((o.goal - o.head).normalize_or_zero()) + 1.0) / 2.0
+}
+
+/// Eq. 9: 0.05 while the poses are natural.
+fn pose(o: &Outcome) -> f32 {
+    if o.natural { 0.05 } else { 0.0 }
 }
 
 /// Eq. 7: 0.05 while the body's box holds too few non-walkable cells to count.
@@ -129,6 +137,7 @@ mod tests {
             goal: Vec3::new(0.8, 0.0, 0.9),
             dist_before: 1.3,
             dist: 0.8,
+            natural: true,
             arrived: false,
             penetrates: false,
             left: 3,
@@ -169,6 +178,7 @@ mod tests {
     fn ends_by_hand() {
         let o = outcome(&[]);
         assert_eq!([penetration(&o), success(&o), arrival(&o)], [0.05, 0.0, 0.0]);
+        assert_eq!([pose(&o), pose(&Outcome { natural: false, ..o })], [0.05, 0.0]);
         let there = Outcome { arrived: true, ..o };
         assert_eq!([penetration(&there), success(&there), arrival(&there)], [0.05, 1.0, 3.0]);
         let crash = Outcome { penetrates: true, ..there };
@@ -178,6 +188,6 @@ mod tests {
     #[test]
     fn weights_are_those_of_the_table() {
         let w: Vec<f32> = TERMS.iter().map(|t| (t.weight)(&Weights::default())).collect();
-        assert_eq!(w, [0.1, 0.3, 1.0, 0.1, 0.3, 0.1, 0.5, 0.0]);
+        assert_eq!(w, [0.1, 0.3, 1.0, 0.1, 0.3, 0.1, 0.1, 0.5, 0.0]);
     }
 }

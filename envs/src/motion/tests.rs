@@ -110,7 +110,8 @@ fn gliding_into_the_box_penetrates() {
         env.step(&[0.8, 0.0, 0.0, 0.0].repeat(8), &mut out).unwrap();
         for (i, hit) in hit.iter_mut().enumerate() {
             let info = &out.info[i * TERMS.len()..][..TERMS.len()];
-            assert_eq!(info[5] == 0.0, out.terminated[i], "the term is lost exactly where the episode ends");
+            let kept = info[TERMS.iter().position(|t| t.name == "penetration").unwrap()];
+            assert_eq!(kept == 0.0, out.terminated[i], "the term is lost exactly where the episode ends");
             *hit |= out.terminated[i];
             let figures = &out.episode[i * EPISODE.len()..][..EPISODE.len()];
             assert_eq!(figures[1] == 1.0, out.terminated[i]);

@@ -2,15 +2,17 @@
 
 use clap::{Args, Parser, Subcommand};
 use egogen::body::BodyModel;
-use egogen::io::write_atomic;
+use egogen::io::{Tensors, write_atomic};
 use egogen::kernels::MotionEngine;
-use egogen::motion::{self, MotionSet, MotionWeights};
+use egogen::motion::{self, MotionSet, MotionWeights, PosePrior};
 use egogen::sim::Sim;
 use egogen_train::primitives::eval::{Effort, evaluate};
 use egogen_train::primitives::fit::{Outcome, Run, Settings};
+use egogen_train::primitives::pose;
 use egogen_train::primitives::seeds::make_seeds;
 use egogen_train::program::{self, Given, INTERRUPTED};
 use egogen_train::{Error, Result};
+use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -30,6 +32,8 @@ enum Command {
     Train(Train),
     /// Judge a motion model again and write metrics.json into its folder.
     Eval(Eval),
+    /// Train a pose prior (VPoser's form) on the recorded poses, choose its threshold, and judge it.
+    Pose(Pose),
     /// Write seeds.safetensors, seeds for the walking task made by the model, into its folder.
     Seeds(Seeds),
 }
@@ -56,6 +60,21 @@ struct Seeds {
     /// Motion-model folder.
     #[arg(long, value_name = "DIR")]
     model: PathBuf,
+}
+
+#[derive(Args)]
+struct Pose {
+    #[command(flatten)]
+    data: Data,
+    /// Folder for pose.safetensors and metrics.json.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Updates.
+    #[arg(long, default_value_t = 6000)]
+    steps: u64,
+    /// Root of all random streams.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
 }
 
 const EFFORT: Effort = Effort { people: 1000, episodes: 200 };
@@ -113,6 +132,7 @@ fn run(command: Command) -> Result<u8> {
             judge(&args.model, &body, &set, &held_out, Effort { people: args.people, episodes: args.episodes })?;
             Ok(0)
         }
+        Command::Pose(args) => train_pose(&args),
         Command::Seeds(args) => {
             let body = BodyModel::embedded();
             let (set, ..) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
@@ -166,5 +186,28 @@ fn train(args: Train) -> Result<u8> {
     }
     write_seeds(run.folder(), &body, &set)?;
     judge(run.folder(), &body, &set, &held_out, EFFORT)?;
+    Ok(0)
+}
+
+fn train_pose(args: &Pose) -> Result<u8> {
+    let body = BodyModel::embedded();
+    let (set, held_out, _) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
+    let bar = ProgressBar::new(args.steps)
+        .with_style(ProgressStyle::with_template("{wide_bar} {pos}/{len} {msg}, {eta} left").unwrap_or(ProgressStyle::default_bar()));
+    let tensors = pose::train(&set, args.steps, args.seed, |step, [error, divergence]| {
+        bar.set_position(step);
+        let text = format!("matrix error {error:.4}, {divergence:.1} nats");
+        if bar.is_hidden() && step.is_multiple_of(500) {
+            eprintln!("update {step}: {text}");
+        }
+        bar.set_message(text);
+    })?;
+    bar.finish();
+    let unjudged = Tensors::from_bytes("the new pose prior", pose::pack(&tensors, 1.0)?)?;
+    let report = pose::judge(&PosePrior::from_tensors(&unjudged)?, &held_out);
+    let text = serde_json::to_string_pretty(&report).map_err(|e| Error::run(e.to_string()))?;
+    println!("{text}");
+    write_atomic(args.out.join("pose.safetensors"), &pose::pack(&tensors, report.threshold)?)?;
+    write_atomic(args.out.join("metrics.json"), format!("{text}\n").as_bytes())?;
     Ok(0)
 }

@@ -4,7 +4,7 @@ use super::Actor;
 use crate::{Error, Result};
 use egogen::body::{BETAS, MARKER_DIM, PARAMS};
 use egogen::metrics::{contact_score, stance_slide};
-use egogen::motion::{FRAMES, SEED};
+use egogen::motion::{FRAMES, PosePrior, SEED};
 use egogen::scene::Setting;
 use egogen_envs::motion::{EPISODE, MotionEnv};
 use egogen_envs::{StepResult, VecEnv};
@@ -29,6 +29,8 @@ pub struct Played {
     pub figures: [f32; EPISODE.len()],
     /// Mean distance between predicted and skinned markers, metres: how far the prediction is from any body.
     pub body_error: f32,
+    /// Mean ||VP|| of its frames under the shipped pose prior (eq. 9).
+    pub pose_norm: f32,
     /// Mean foot contact score of its primitives (eq. 12).
     pub contact: f32,
     /// Mean slide per stance of its primitives, metres.
@@ -52,13 +54,14 @@ impl Played {
 #[derive(Clone, Default)]
 struct Running {
     steps: f32,
-    sums: [f32; 5],
+    sums: [f32; 6],
     film: Film,
 }
 
 /// The first episode of every environment of `env` (one start each, numbered from 0) with `actor`. `record` keeps the motion.
 pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Result<Vec<Played>> {
     let n = env.num_envs();
+    let prior = PosePrior::embedded()?;
     let (mut obs, mut result) = (Vec::new(), StepResult::default());
     env.reset(seed, &mut obs)?;
     let mut running = vec![Running::default(); n];
@@ -71,7 +74,7 @@ pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Resu
         env.step(&choice.latents, &mut result)?;
         for i in (0..n).filter(|&i| done[i].is_none()).collect::<Vec<_>>() {
             let kl = [&choice.kl, &choice.kl_mean].map(|k| k.get(i).copied().unwrap_or(f32::NAN));
-            running[i].add(env, i, kl, record);
+            running[i].add(env, &prior, i, kl, record);
             if result.terminated[i] || result.truncated[i] {
                 let figures = result.episode[i * EPISODE.len()..].first_chunk().copied().unwrap_or_default();
                 done[i] = Some(std::mem::take(&mut running[i]).finish(i as u64, figures, record));
@@ -90,14 +93,16 @@ pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Resu
 }
 
 impl Running {
-    fn add(&mut self, env: &MotionEnv, i: usize, kl: [f32; 2], record: bool) {
+    fn add(&mut self, env: &MotionEnv, prior: &PosePrior, i: usize, kl: [f32; 2], record: bool) {
         let prims = env.primitives();
         let markers = &prims.markers[i * FRAMES * MARKER_DIM..][..FRAMES * MARKER_DIM];
         let params = &prims.params[i * FRAMES * PARAMS..][..FRAMES * PARAMS];
         let mut betas = [0.0; BETAS];
         betas.copy_from_slice(&self.film.betas);
         let shaped = env.sim().body().shape(&betas);
-        let figures = [body_error(&shaped, markers, params), contact_score(markers), stance_slide(markers), kl[0], kl[1]];
+        let norms = prior.norms(&params[SEED * PARAMS..]);
+        let pose_norm = norms.iter().sum::<f32>() / norms.len() as f32;
+        let figures = [body_error(&shaped, markers, params), pose_norm, contact_score(markers), stance_slide(markers), kl[0], kl[1]];
         self.sums.iter_mut().zip(figures).for_each(|(sum, x)| *sum += x);
         if record {
             let from = if self.steps == 0.0 { 0 } else { SEED };
@@ -111,8 +116,8 @@ impl Running {
     }
 
     fn finish(self, start: u64, figures: [f32; EPISODE.len()], record: bool) -> Played {
-        let [body_error, contact, slide, kl, kl_mean] = self.sums.map(|s| s / self.steps);
-        Played { start, figures, body_error, contact, slide, kl, kl_mean, film: record.then_some(self.film) }
+        let [body_error, pose_norm, contact, slide, kl, kl_mean] = self.sums.map(|s| s / self.steps);
+        Played { start, figures, body_error, pose_norm, contact, slide, kl, kl_mean, film: record.then_some(self.film) }
     }
 }
 

@@ -60,6 +60,8 @@ pub struct Row {
     pub steps: Option<Estimate>,
     /// Distance between predicted and skinned markers, millimetres.
     pub body_error_mm: Option<Estimate>,
+    /// ||VP|| under the shipped pose prior (eq. 9).
+    pub pose_norm: Option<Estimate>,
     /// Foot contact score (eq. 12).
     pub contact: Option<Estimate>,
     /// Slide per stance, centimetres.
@@ -85,6 +87,7 @@ impl Row {
             final_dist: average(&|p| p.figure("final_dist")),
             steps: average(&|p| p.figure("steps")),
             body_error_mm: average(&|p| 1000.0 * p.body_error),
+            pose_norm: average(&|p| p.pose_norm),
             contact: average(&|p| p.contact),
             slide_cm: average(&|p| 100.0 * p.slide),
             kl: average(&|p| p.kl),
@@ -96,13 +99,13 @@ impl Row {
 /// The rows as a Markdown table.
 pub fn table(rows: &[Row]) -> String {
     let mut text = String::from(
-        "| policy | success % | hit % | hover % | return | final m | steps | body error mm | contact | slide cm | KL | 0.5 mean mu^2 |\n|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+        "| policy | success % | hit % | hover % | return | final m | steps | body error mm | VP norm | contact | slide cm | KL | 0.5 mean mu^2 |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for r in rows {
         let percent = |e: Estimate| format!("{:.1} ({:.0}-{:.0})", 100.0 * e.value, 100.0 * e.low, 100.0 * e.high);
         let number = |e: Option<Estimate>, digits: usize| e.map_or("-".into(), |e| format!("{:.digits$}", e.value));
         text += &format!(
-            "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |\n",
+            "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |\n",
             r.name,
             percent(r.success),
             percent(r.penetration),
@@ -111,6 +114,7 @@ pub fn table(rows: &[Row]) -> String {
             number(r.final_dist, 2),
             number(r.steps, 1),
             number(r.body_error_mm, 1),
+            number(r.pose_norm, 2),
             number(r.contact, 3),
             number(r.slide_cm, 2),
             number(r.kl, 3),

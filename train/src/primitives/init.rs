@@ -11,7 +11,7 @@ fn uniform(rng: &mut Stream, n: usize, bound: f32) -> Vec<f32> {
 }
 
 /// torch's default: +- 1 / sqrt(inputs).
-fn dense(rng: &mut Stream, input: usize, output: usize) -> Dense {
+pub fn dense(rng: &mut Stream, input: usize, output: usize) -> Dense {
     let bound = 1.0 / (input as f32).sqrt();
     Dense { input, output, weight: uniform(rng, input * output, bound), bias: uniform(rng, output, bound) }
 }

@@ -7,6 +7,7 @@ pub mod gait;
 pub mod init;
 pub mod layers;
 pub mod loss;
+pub mod pose;
 pub mod predictor;
 pub mod progress;
 pub mod regressor;

@@ -68,7 +68,7 @@ pub fn run(registry: &Registry) -> ExitCode {
 fn act(args: &Args, registry: &Registry) -> Result<u8> {
     if args.list {
         for (name, text) in EMBEDDED {
-            println!("{name:<8} {}", Recipe::parse(name, text, &[])?.about);
+            println!("{name:<24} {}", Recipe::parse(name, text, &[])?.about);
         }
         return Ok(0);
     }

@@ -7,11 +7,15 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// The recipes that come with the program: file stem and content.
-pub const EMBEDDED: [(&str, &str); 4] = [
+pub const EMBEDDED: [(&str, &str); 8] = [
     ("quick", include_str!("../recipes/quick.toml")),
     ("paper", include_str!("../recipes/paper.toml")),
     ("point", include_str!("../recipes/point.toml")),
+    ("cartpole", include_str!("../recipes/cartpole.toml")),
+    ("acrobot", include_str!("../recipes/acrobot.toml")),
     ("pendulum", include_str!("../recipes/pendulum.toml")),
+    ("mountaincar", include_str!("../recipes/mountaincar.toml")),
+    ("mountaincar_continuous", include_str!("../recipes/mountaincar_continuous.toml")),
 ];
 
 /// A recipe as written.

@@ -1,24 +1,28 @@
 //! Checkpoints: everything a run needs to continue bit for bit.
 //!
 //! `checkpoints/epoch-NNNN/` (or `epoch-NNNN-update-MMMM/`, where a run was interrupted within the next epoch) holds
-//! `model.safetensors`, `optimizer.safetensors`, `state.bin` (environments, counters, sums of a begun epoch) and
+//! `model.safetensors`, `optimizer.safetensors`, `state.bin` (environments, counters, sums of a begun epoch), `recipe.toml` and
 //! `checkpoint.json`, which describes the policy and carries the hashes of the other files.
 
 use crate::ppo::Progress;
+use crate::recipe::CheckpointConfig;
 use crate::stats::EpochStats;
 use crate::{AdamW, Error, Result};
 use egogen::agent::{ActionSpace, ObsLayout, PolicyConfig, PolicySpec};
-use egogen::io::{Precision, Tensors, content_hash, pack_tensors, write_atomic};
+use egogen::io::{Precision, Tensors, content_hash, pack_tensors, sync_folder, write_atomic};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-const FORMAT: u32 = 2;
-const DESCRIPTION: &str = "checkpoint.json";
+const FORMAT: u32 = 3;
+/// Oldest format that is read: it has no `recipe.toml` and no [`State::last_epoch`].
+const OLDEST: u32 = 2;
+pub(crate) const DESCRIPTION: &str = "checkpoint.json";
 const MODEL: &str = "model.safetensors";
 const OPTIMIZER: &str = "optimizer.safetensors";
-const STATE: &str = "state.bin";
+pub(crate) const STATE: &str = "state.bin";
+pub(crate) const RECIPE: &str = "recipe.toml";
 
 /// What a checkpoint says about itself.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -72,11 +76,15 @@ pub struct State {
     pub stats: EpochStats,
     /// What [`crate::Collector::save`] wrote.
     pub collector: Vec<u8>,
+    /// Figures of the last whole epoch.
+    pub last_epoch: BTreeMap<String, f64>,
 }
 
 /// A whole checkpoint in memory.
 pub struct Checkpoint {
     pub description: Description,
+    /// The run's recipe as TOML; `None` in checkpoints of format 2.
+    pub recipe: Option<String>,
     pub params: Vec<f32>,
     pub adam: AdamW,
     pub state: State,
@@ -91,8 +99,23 @@ impl Checkpoint {
         }
     }
 
-    /// Writes the checkpoint below `root` under a temporary name and renames it.
+    /// Writes the checkpoint below `root` under a temporary name and renames it; nothing stays behind where that fails.
     pub fn write(&self, root: &Path, spec: &PolicySpec) -> Result<()> {
+        let name = self.name();
+        let temporary = root.join(format!(".{name}.tmp"));
+        remove(&temporary)?;
+        let written = self.write_files(&temporary, spec).and_then(|()| {
+            discard(root, &name)?;
+            let last = root.join(&name);
+            fs::rename(&temporary, &last).and_then(|()| sync_folder(root)).map_err(|e| egogen::Error::io(&last, e).into())
+        });
+        if written.is_err() {
+            let _ = fs::remove_dir_all(&temporary);
+        }
+        written
+    }
+
+    fn write_files(&self, dir: &Path, spec: &PolicySpec) -> Result<()> {
         let metadata = BTreeMap::new();
         let moments: Vec<_> = [("first", &self.adam.first), ("second", &self.adam.second)]
             .into_iter()
@@ -103,23 +126,18 @@ impl Checkpoint {
             (MODEL, pack_tensors(&spec.to_tensors(&self.params), &metadata, Precision::Full)?),
             (OPTIMIZER, pack_tensors(&moments, &metadata, Precision::Full)?),
             (STATE, state),
+            (RECIPE, self.recipe.clone().unwrap_or_default().into_bytes()),
         ];
         let mut description = self.description.clone();
-        let name = self.name();
-        let (temporary, last) = (root.join(format!(".{name}.tmp")), root.join(&name));
-        let io = |path: &Path, e| Error::Core(egogen::Error::io(path, e));
-        remove(&temporary)?;
         for (file, bytes) in &files {
-            write_atomic(temporary.join(file), bytes)?;
+            write_atomic(dir.join(file), bytes)?;
             description.files.insert(file.to_string(), content_hash(bytes));
         }
         let text = serde_json::to_string_pretty(&description).map_err(|e| Error::run(format!("cannot describe the checkpoint: {e}")))?;
-        write_atomic(temporary.join(DESCRIPTION), text.as_bytes())?;
-        remove(&last)?;
-        fs::rename(&temporary, &last).map_err(|e| io(&last, e))
+        Ok(write_atomic(dir.join(DESCRIPTION), text.as_bytes())?)
     }
 
-    /// Reads a checkpoint folder; every file must be whole.
+    /// Reads a checkpoint folder; every file must be whole and belong to the others.
     pub fn read(dir: &Path) -> Result<Self> {
         let description = Self::describe(dir)?;
         let spec = PolicySpec::new(description.policy.clone(), description.layout.clone(), description.action)?;
@@ -131,12 +149,25 @@ impl Checkpoint {
                 _ => Err(egogen::Error::file(&path, "is damaged: its content does not have the hash in checkpoint.json").into()),
             }
         };
-        let state: State = postcard::from_bytes(&checked(STATE)?).map_err(|e| egogen::Error::file(dir.join(STATE), e.to_string()))?;
+        let mut state = checked(STATE)?;
+        if description.format == OLDEST {
+            // postcard writes fields one after the other, and an empty map as one zero.
+            state.push(0);
+        }
+        let state: State = postcard::from_bytes(&state).map_err(|e| egogen::Error::file(dir.join(STATE), e.to_string()))?;
+        if (description.epoch, description.env_steps) != (state.epoch, state.env_steps) {
+            let what = format!("is of epoch {}, but {STATE} is of epoch {}", description.epoch, state.epoch);
+            return Err(egogen::Error::file(dir.join(DESCRIPTION), what).into());
+        }
+        let recipe = match description.format {
+            OLDEST => None,
+            _ => Some(String::from_utf8(checked(RECIPE)?).map_err(|e| egogen::Error::file(dir.join(RECIPE), e.to_string()))?),
+        };
         let params = spec.from_tensors(&Tensors::from_bytes(dir.join(MODEL), checked(MODEL)?)?)?;
         let moments = Tensors::from_bytes(dir.join(OPTIMIZER), checked(OPTIMIZER)?)?;
         let size = [spec.learned()];
         let adam = AdamW { steps: state.adam_steps, first: moments.f32s("first", &size)?, second: moments.f32s("second", &size)? };
-        Ok(Self { description, params, adam, state })
+        Ok(Self { description, recipe, params, adam, state })
     }
 
     /// The description and the parameters alone.
@@ -147,14 +178,30 @@ impl Checkpoint {
         Ok((whole.description, spec, whole.params))
     }
 
+    /// A folder under another checkpoint's name would be taken for newer or older than it is.
+    fn check_name(&self, dir: &Path, name: &str) -> Result<()> {
+        if position(name) == position(&self.name()) {
+            return Ok(());
+        }
+        Err(egogen::Error::file(dir.join(DESCRIPTION), format!("is {}, in a folder of another name", self.name())).into())
+    }
+
     fn describe(dir: &Path) -> Result<Description> {
         let path = dir.join(DESCRIPTION);
         let text = fs::read_to_string(&path).map_err(|e| egogen::Error::io(&path, e))?;
-        let description: Description = serde_json::from_str(&text).map_err(|e| egogen::Error::file(&path, e.to_string()))?;
-        if description.format != FORMAT {
-            return Err(egogen::Error::file(&path, format!("format is {}, expected {FORMAT}", description.format)).into());
+        let bad = |what: String| Error::Core(egogen::Error::file(&path, what));
+        // Other formats have other keys, so this one is looked at first.
+        #[derive(Deserialize)]
+        struct Version {
+            format: u32,
         }
-        Ok(description)
+        match serde_json::from_str::<Version>(&text).map_err(|e| bad(e.to_string()))?.format {
+            OLDEST..=FORMAT => serde_json::from_str(&text).map_err(|e| bad(e.to_string())),
+            newer if newer > FORMAT => {
+                Err(bad(format!("format is {newer}, from a newer version of this program; expected at most {FORMAT}")))
+            }
+            older => Err(bad(format!("format is {older}, which can no longer be read; expected {OLDEST} or {FORMAT}"))),
+        }
     }
 }
 
@@ -163,38 +210,129 @@ impl Description {
     pub const FORMAT: u32 = FORMAT;
 }
 
+/// Epoch and update in a checkpoint's folder name.
+fn position(name: &str) -> Option<(u64, u64)> {
+    let (epoch, update) = name.strip_prefix("epoch-").map(|n| n.split_once("-update-").unwrap_or((n, "0")))?;
+    Some((epoch.parse().ok()?, update.parse().ok()?))
+}
+
 /// Names of all checkpoints below `root`, oldest first.
 pub fn list(root: &Path) -> Vec<String> {
     let entries = fs::read_dir(root).into_iter().flatten().flatten();
-    let mut names: Vec<String> = entries.filter_map(|e| e.file_name().into_string().ok()).filter(|n| n.starts_with("epoch-")).collect();
-    names.sort();
+    let mut names: Vec<String> = entries.filter_map(|e| e.file_name().into_string().ok()).filter(|n| position(n).is_some()).collect();
+    names.sort_by_key(|n| position(n));
     names
 }
 
-/// The newest whole checkpoint below `root`; `warn` hears about each that is damaged.
-pub fn newest(root: &Path, mut warn: impl FnMut(String)) -> Result<Checkpoint> {
+/// The newest checkpoint below `root` that is whole and that `accept` takes; `None` where there is no checkpoint at all.
+///
+/// Newer ones that cannot be used are set aside as `refused-NAME`, and `warn` hears about each.
+/// Fails with every checkpoint's reason where none can be used.
+pub fn newest(root: &Path, mut accept: impl FnMut(&Checkpoint) -> Result<()>, mut warn: impl FnMut(String)) -> Result<Option<Checkpoint>> {
+    let mut refused: Vec<(String, Error)> = Vec::new();
     for name in list(root).into_iter().rev() {
-        match Checkpoint::read(&root.join(&name)) {
-            Ok(checkpoint) => return Ok(checkpoint),
-            Err(e) => warn(format!("checkpoint {name} cannot be used: {e}")),
+        let dir = root.join(&name);
+        match Checkpoint::read(&dir).and_then(|c| c.check_name(&dir, &name).and_then(|()| accept(&c)).map(|()| c)) {
+            Ok(checkpoint) => {
+                for (bad, why) in refused {
+                    let aside = root.join(format!("refused-{bad}"));
+                    remove(&aside)?;
+                    fs::rename(root.join(&bad), &aside).map_err(|e| egogen::Error::io(&aside, e))?;
+                    warn(format!("{why}; the run continues from {name}, and {bad} is now refused-{bad}"));
+                }
+                return Ok(Some(checkpoint));
+            }
+            Err(why) => refused.push((name, why)),
         }
     }
-    Err(Error::run(format!("{}: holds no whole checkpoint", root.display())))
+    if refused.is_empty() {
+        return Ok(None);
+    }
+    let reasons: Vec<String> = refused.iter().map(|(_, why)| format!("\n  {why}")).collect();
+    Err(Error::config(format!("{}: no checkpoint can be continued:{}", root.display(), reasons.concat())))
 }
 
-/// Removes all but the newest `keep` checkpoints and the best.
-pub fn prune(root: &Path, keep: usize, best: Option<&Best>) -> Result<()> {
+/// Removes checkpoints but for the newest `keep`, the best, and those of whole epochs that `keep_every` divides.
+pub fn prune(root: &Path, rule: &CheckpointConfig, best: Option<&Best>) -> Result<()> {
     let names = list(root);
-    let old = names.len().saturating_sub(keep);
-    for name in names[..old].iter().filter(|n| best.is_none_or(|b| b.name != **n)) {
-        remove(&root.join(name))?;
+    let old = names.len().saturating_sub(rule.keep);
+    for name in &names[..old] {
+        let every = rule.keep_every.is_some_and(|n| position(name).is_some_and(|(epoch, update)| epoch.is_multiple_of(n) && update == 0));
+        if !every && best.is_none_or(|b| b.name != *name) {
+            discard(root, name)?;
+        }
     }
     Ok(())
 }
 
-fn remove(dir: &PathBuf) -> Result<()> {
+/// Whether a file or folder of that name was being written, or removed, when its program was killed.
+pub fn is_leftover(name: &str) -> bool {
+    name.rsplit_once(".tmp").is_some_and(|(_, process)| process.bytes().all(|b| b.is_ascii_digit()))
+}
+
+/// Removes what a killed program left half done in `dir`.
+pub fn sweep(dir: &Path) -> Result<()> {
+    for entry in fs::read_dir(dir).into_iter().flatten().flatten() {
+        let path = entry.path();
+        if !entry.file_name().to_str().is_some_and(is_leftover) {
+            continue;
+        }
+        if path.is_dir() {
+            remove(&path)?;
+        } else {
+            fs::remove_file(&path).map_err(|e| egogen::Error::io(&path, e))?;
+        }
+    }
+    Ok(())
+}
+
+/// Removes a checkpoint in one step, so that a kill leaves it whole or not at all.
+fn discard(root: &Path, name: &str) -> Result<()> {
+    let (from, to) = (root.join(name), root.join(format!(".{name}.old.tmp")));
+    remove(&to)?;
+    match fs::rename(&from, &to) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(egogen::Error::io(&from, e).into()),
+        _ => remove(&to),
+    }
+}
+
+fn remove(dir: &Path) -> Result<()> {
     match fs::remove_dir_all(dir) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(egogen::Error::io(dir, e).into()),
         _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_newest_the_best_and_every_nth_are_kept() {
+        let root = tempfile::tempdir().unwrap();
+        let rule = |keep, keep_every| CheckpointConfig { every: 1, keep, keep_every, best: String::new(), max_kl_prior: None };
+        let best = Best { name: "epoch-0003".into(), value: 1.0 };
+        let names = ["epoch-0002", "epoch-0003", "epoch-0004", "epoch-0004-update-0002", "epoch-0005", "epoch-9999", "epoch-10000"];
+        names.iter().for_each(|n| fs::create_dir(root.path().join(n)).unwrap());
+        fs::create_dir(root.path().join("refused-epoch-0001")).unwrap();
+        assert_eq!(list(root.path()), names, "by number, not by letter");
+        prune(root.path(), &rule(3, Some(4)), Some(&best)).unwrap();
+        assert_eq!(list(root.path()), ["epoch-0003", "epoch-0004", "epoch-0005", "epoch-9999", "epoch-10000"]);
+        prune(root.path(), &rule(1, None), None).unwrap();
+        assert_eq!(list(root.path()), ["epoch-10000"]);
+        assert_eq!(fs::read_dir(root.path()).unwrap().count(), 2, "nothing half removed, and what was set aside stays");
+    }
+
+    #[test]
+    fn only_what_was_half_done_is_swept() {
+        let root = tempfile::tempdir().unwrap();
+        for name in ["metrics.csv", "metrics.csv.tmp71", "a.tmpl"] {
+            fs::write(root.path().join(name), "x").unwrap();
+        }
+        fs::create_dir_all(root.path().join(".epoch-0002.tmp/inner")).unwrap();
+        sweep(root.path()).unwrap();
+        let mut left: Vec<_> = fs::read_dir(root.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+        left.sort();
+        assert_eq!(left, ["a.tmpl", "metrics.csv"]);
     }
 }

@@ -1,5 +1,6 @@
 //! The program `train`.
 
+use crate::checkpoint::is_leftover;
 use crate::program::{self, INTERRUPTED};
 use crate::recipe::{EMBEDDED, Plan, Recipe, of_run};
 use crate::registry::{Purpose, Registry};
@@ -7,6 +8,7 @@ use crate::trainer::{Outcome, Trainer, policy_spec};
 use crate::{Error, Result};
 use clap::Parser;
 use egogen::agent::ActionSpace;
+use std::fs::DirEntry;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -119,7 +121,9 @@ fn start_threads(wanted: Option<usize>) -> Result<usize> {
 
 /// The given folder, which must be new or empty; or the first free one below `runs`.
 fn run_folder(given: Option<&Path>, name: &str) -> Result<PathBuf> {
-    let free = |dir: &Path| std::fs::read_dir(dir).map_or(!dir.exists(), |mut entries| entries.next().is_none());
+    // A run that was killed at once leaves a folder in which nothing is whole.
+    let whole = |entry: std::io::Result<DirEntry>| !entry.is_ok_and(|e| e.file_name().to_str().is_some_and(is_leftover));
+    let free = |dir: &Path| std::fs::read_dir(dir).map_or(!dir.exists(), |mut entries| !entries.any(whole));
     match given {
         Some(dir) if free(dir) => Ok(dir.into()),
         Some(dir) => Err(Error::config(format!("--out {}: is not empty; give a new folder, or --resume to continue there", dir.display()))),

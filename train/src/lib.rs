@@ -22,6 +22,7 @@ mod running;
 mod schedule;
 mod shards;
 pub mod stats;
+pub mod tensorboard;
 pub mod trainer;
 
 pub use acts::Acts;

@@ -1,4 +1,4 @@
-//! Where figures go: CSV files, TensorBoard, the terminal.
+//! Where figures go: CSV files and the terminal; [`crate::tensorboard`] has a module of its own.
 
 use crate::stats::Row;
 use crate::{Error, Result};
@@ -6,7 +6,6 @@ use indicatif::{ProgressBar, ProgressStyle};
 use std::fs::{File, OpenOptions};
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
-use tensorboard_rs::summary_writer::SummaryWriter;
 
 /// Receives the figures of every epoch.
 pub trait Logger {
@@ -14,7 +13,7 @@ pub trait Logger {
     fn log(&mut self, epoch: u64, row: &Row) -> Result<()>;
 }
 
-/// A CSV file, one line per epoch, flushed at once.
+/// A CSV file, one line per epoch, on disk at once.
 pub struct Csv {
     path: PathBuf,
     file: File,
@@ -25,13 +24,46 @@ impl Csv {
     /// Opens `path`, keeping the lines of epochs up to `epoch` (those after the checkpoint that a run continues from are dropped).
     pub fn open(path: &Path, epoch: u64) -> Result<Self> {
         let io = |e| Error::Core(egogen::Error::io(path, e));
-        let old = std::fs::read_to_string(path).unwrap_or_default();
-        let line_epoch = |line: &str| line.split(',').next().and_then(|n| n.parse::<u64>().ok());
-        let kept: String = old.lines().filter(|l| line_epoch(l).is_none_or(|n| n <= epoch)).flat_map(|l| [l, "\n"]).collect();
+        let kept = Rows::of(&read(path)?).up_to(epoch);
         let kept = if epoch == 0 { String::new() } else { kept };
         egogen::io::write_atomic(path, kept.as_bytes())?;
         let file = OpenOptions::new().append(true).open(path).map_err(io)?;
         Ok(Self { path: path.into(), file, header: kept.is_empty() })
+    }
+
+    /// The last epoch that the file `path` reports; 0 without one.
+    pub fn epochs(path: &Path) -> Result<u64> {
+        Ok(Rows::of(&read(path)?).lines.last().map_or(0, |(epoch, _)| *epoch))
+    }
+}
+
+/// The text of the file `path`, which need not exist.
+fn read(path: &Path) -> Result<String> {
+    match std::fs::read_to_string(path) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(egogen::Error::io(path, e).into()),
+        text => Ok(text.unwrap_or_default()),
+    }
+}
+
+/// The header and the whole lines of a CSV file, with their epochs; the last may have been cut off, by a full disk or a kill.
+struct Rows<'a> {
+    header: &'a str,
+    lines: Vec<(u64, &'a str)>,
+}
+
+impl<'a> Rows<'a> {
+    fn of(text: &'a str) -> Self {
+        let mut lines = text.split_inclusive('\n').filter(|l| l.ends_with('\n'));
+        let header = lines.next().unwrap_or_default();
+        let width = |line: &str| line.split(',').count();
+        let lines = lines.filter(|l| width(l) == width(header));
+        let lines = lines.filter_map(|l| Some((l.split(',').next()?.parse().ok()?, l))).collect();
+        Self { header, lines }
+    }
+
+    fn up_to(&self, epoch: u64) -> String {
+        let kept = self.lines.iter().filter(|(n, _)| *n <= epoch).map(|(_, line)| *line);
+        std::iter::once(self.header).chain(kept).collect()
     }
 }
 
@@ -48,31 +80,8 @@ impl Logger for Csv {
             text += &value.map_or(",".into(), |v| format!(",{v}"));
         }
         text += "\n";
-        self.file.write_all(text.as_bytes()).map_err(|e| Error::Core(egogen::Error::io(&self.path, e)))
-    }
-}
-
-/// TensorBoard event files; scalars only.
-pub struct TensorBoard {
-    writer: SummaryWriter,
-}
-
-impl TensorBoard {
-    /// Event files in `dir`.
-    pub fn new(dir: &Path) -> Self {
-        Self { writer: SummaryWriter::new(dir) }
-    }
-}
-
-impl Logger for TensorBoard {
-    fn log(&mut self, epoch: u64, row: &Row) -> Result<()> {
-        for (name, value) in row {
-            if let Some(value) = value {
-                self.writer.add_scalar(name, *value as f32, epoch as usize);
-            }
-        }
-        self.writer.flush();
-        Ok(())
+        let written = self.file.write_all(text.as_bytes()).and_then(|()| self.file.sync_data());
+        written.map_err(|e| Error::Core(egogen::Error::io(&self.path, e)))
     }
 }
 
@@ -132,5 +141,30 @@ impl Console {
             line += &format!("  ETA {:.0} s", left_seconds);
         }
         self.say(&line);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_whole_rows_up_to_the_checkpoint_stay() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("metrics.csv");
+        let row: Row = vec![("a".into(), Some(0.5)), ("b".into(), None)];
+        assert_eq!(Csv::epochs(&path).unwrap(), 0);
+        let mut csv = Csv::open(&path, 0).unwrap();
+        (1..=12).for_each(|epoch| csv.log(epoch, &row).unwrap());
+        assert_eq!(Csv::epochs(&path).unwrap(), 12);
+        // Row 13 cut to "1,0.5," would pass for row 1, but for its missing end of line.
+        let whole = std::fs::read_to_string(&path).unwrap();
+        std::fs::write(&path, format!("{whole}1\n1,0.5,")).unwrap();
+        Csv::open(&path, 2).unwrap().log(3, &row).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "epoch,a,b\n1,0.5,\n2,0.5,\n3,0.5,\n");
+        Csv::open(&path, 0).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "");
+        std::fs::write(&path, [0xff]).unwrap();
+        assert!(Csv::open(&path, 2).err().unwrap().to_string().contains("metrics.csv"));
     }
 }

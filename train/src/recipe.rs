@@ -4,6 +4,7 @@ use crate::{AdamConfig, Error, PpoConfig, Result, Schedule};
 use egogen::agent::PolicyConfig;
 use egogen::device::DeviceChoice;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The recipes that come with the program: file stem and content.
@@ -86,6 +87,9 @@ pub struct CheckpointConfig {
     pub every: u64,
     /// Newest checkpoints kept beside the best one.
     pub keep: usize,
+    /// Checkpoints of epochs that this divides are kept as well, for good.
+    #[serde(default)]
+    pub keep_every: Option<u64>,
     /// The figure of metrics.csv that makes a checkpoint the best; larger is better.
     pub best: String,
     /// Checkpoints whose loss/kl_prior is above this cannot be the best: their actions left what the motion model knows.
@@ -165,6 +169,9 @@ impl Recipe {
         self.expect("run.collect_steps", run.collect_steps, whole, &format!("a multiple of run.envs = {}", run.envs))?;
         let whole = run.collect_steps.is_multiple_of(self.ppo.batch);
         self.expect("ppo.batch", self.ppo.batch, whole, &format!("a divisor of run.collect_steps = {}", run.collect_steps))?;
+        let (every, keep_every) = (self.checkpoint.every, self.checkpoint.keep_every.unwrap_or(self.checkpoint.every));
+        let whole = keep_every > 0 && keep_every.is_multiple_of(every);
+        self.expect("checkpoint.keep_every", keep_every, whole, &format!("a multiple of checkpoint.every = {every}"))?;
         let (ppo, adam) = (&self.ppo, &self.adam);
         for (key, value) in [("ppo.gamma", ppo.gamma), ("ppo.lambda", ppo.lambda)] {
             self.expect(key, value, (0.0..=1.0).contains(&value), "0 to 1")?;
@@ -237,9 +244,38 @@ pub fn changed<T: Serialize + serde::de::DeserializeOwned>(what: &str, base: T, 
     table.try_into().map_err(|e: toml::de::Error| bad(e.to_string()))
 }
 
+/// What a continued run may change.
+const MAY: [&str; 3] = ["run.epochs", "checkpoint.", "test."];
+
+/// The first key, of those that a continued run may not change, in which recipes differ, with both values.
+pub fn difference(a: &Recipe, b: &Recipe) -> Result<Option<(String, [String; 2])>> {
+    let [a, b] = [a, b].map(|recipe| -> Result<BTreeMap<_, _>> {
+        let table = toml::from_str(&recipe.to_toml()?).map_err(|e| Error::run(format!("cannot read back the recipe: {e}")))?;
+        let mut values = BTreeMap::new();
+        flatten("", &table, &mut values);
+        // Keys outside tables first: a foreign recipe is known by its name.
+        Ok(values.into_iter().map(|(key, value)| ((key.contains('.'), key), value)).collect())
+    });
+    let (a, b) = (a?, b?);
+    let binding = |key: &str| key != "about" && !MAY.iter().any(|m| key.starts_with(m));
+    let keys = a.keys().chain(b.keys()).filter(|(_, key)| binding(key));
+    let shown = |of: &BTreeMap<(bool, String), String>, key| of.get(key).cloned().unwrap_or_else(|| "not set".into());
+    let first = keys.filter(|key| a.get(*key) != b.get(*key)).min();
+    Ok(first.map(|key| (key.1.clone(), [shown(&a, key), shown(&b, key)])))
+}
+
+/// Every value under its whole key.
+fn flatten(prefix: &str, table: &toml::Table, out: &mut BTreeMap<String, String>) {
+    for (key, value) in table {
+        match value {
+            toml::Value::Table(inner) => flatten(&format!("{prefix}{key}."), inner, out),
+            value => _ = out.insert(format!("{prefix}{key}"), value.to_string()),
+        }
+    }
+}
+
 /// Reads the resolved recipe of the run in `dir`, with changes that a continued run may make.
 pub fn of_run(dir: &Path, changes: &[String]) -> Result<Recipe> {
-    const MAY: [&str; 3] = ["run.epochs", "checkpoint.", "test."];
     if let Some(change) = changes.iter().find(|c| !MAY.iter().any(|m| c.starts_with(m))) {
         return Err(Error::config(format!("--set {change}: a continued run can change only run.epochs, checkpoint.* and test.*")));
     }
@@ -253,6 +289,27 @@ pub fn of_run(dir: &Path, changes: &[String]) -> Result<Recipe> {
 mod tests {
     use super::*;
     use crate::registry::{Purpose, Registry};
+
+    #[test]
+    fn differences_are_named() {
+        let point = |changes: &[&str]| Recipe::load("point", &changes.iter().map(|c| c.to_string()).collect::<Vec<_>>()).unwrap();
+        let of = |a: &[&str], b: &[&str]| difference(&point(a), &point(b)).unwrap();
+        let found = |key: &str, a: &str, b: &str| Some((key.to_string(), [a.to_string(), b.to_string()]));
+        assert_eq!(of(&[], &["run.epochs=99", "test.every=3", "checkpoint.keep=9", "about=other"]), None);
+        assert_eq!(of(&[], &["ppo.gamma=0.5", "adam.lr=1e-3"]), found("ppo.gamma", "0.95", "0.5"));
+        assert_eq!(of(&["ppo.dual_clip=3.0"], &[]), found("ppo.dual_clip", "3.0", "not set"));
+        assert_eq!(of(&["adam.lr=1.0", "seed=3"], &[]), found("seed", "3", "0"), "keys outside tables come first");
+    }
+
+    #[test]
+    fn what_is_kept_must_be_written() {
+        let keep_every = |n: u64| Recipe::load("point", &[format!("checkpoint.keep_every={n}")]).unwrap().plan();
+        assert!(keep_every(4).is_ok());
+        for n in [0, 3] {
+            let e = keep_every(n).unwrap_err().to_string();
+            assert!(e.contains("checkpoint.keep_every") && e.contains("multiple of checkpoint.every = 2"), "{e}");
+        }
+    }
 
     #[test]
     fn every_recipe_of_a_reference_task_is_valid() {

@@ -1,14 +1,15 @@
 //! The run: collect, update, report, test, save; from the start or from a checkpoint.
 
-use crate::checkpoint::{self, Best, Checkpoint, Description, State};
+use crate::checkpoint::{self, Best, Checkpoint, DESCRIPTION, Description, RECIPE, STATE, State};
 use crate::collector::{Collector, test_episodes};
-use crate::logger::{Console, Csv, Logger, TensorBoard};
+use crate::logger::{Console, Csv, Logger};
 use crate::policy::Compute;
 use crate::ppo::{Learner, Rules};
-use crate::recipe::Plan;
+use crate::recipe::{Plan, Recipe, difference};
 use crate::registry::{Purpose, Registry};
 use crate::shards::Shards;
 use crate::stats::{Episodes, EpochStats, Row};
+use crate::tensorboard::TensorBoard;
 use crate::{AdamW, Error, Result};
 use egogen::agent::{ObsLayout, PolicySpec, bundle};
 use egogen::io::write_atomic;
@@ -41,6 +42,7 @@ pub struct Trainer {
     stats: EpochStats,
     best: Option<Best>,
     last_test: BTreeMap<String, f64>,
+    last_epoch: BTreeMap<String, f64>,
 }
 
 /// The policy that a plan trains in these environments.
@@ -62,10 +64,9 @@ impl Trainer {
         Self::build(plan, registry, dir, threads, None)?.note_recipe()
     }
 
-    /// Continues the run in `dir` from its newest whole checkpoint.
-    pub fn resume(plan: Plan, registry: &Registry, dir: &Path, threads: usize, warn: impl FnMut(String)) -> Result<Self> {
-        let from = checkpoint::newest(&dir.join("checkpoints"), warn)?;
-        Self::build(plan, registry, dir, threads, Some(from))?.note_recipe()
+    /// Continues the run in `dir` from its newest usable checkpoint, or from the start where it was killed before the first.
+    pub fn resume(plan: Plan, registry: &Registry, dir: &Path, threads: usize, mut warn: impl FnMut(String)) -> Result<Self> {
+        Self::build(plan, registry, dir, threads, Some(&mut warn))?.note_recipe()
     }
 
     fn note_recipe(self) -> Result<Self> {
@@ -73,7 +74,8 @@ impl Trainer {
         Ok(self)
     }
 
-    fn build(plan: Plan, registry: &Registry, dir: &Path, threads: usize, from: Option<Checkpoint>) -> Result<Self> {
+    /// `resume`: hears of checkpoints in `dir` that cannot be used; `None` for a new run.
+    fn build(plan: Plan, registry: &Registry, dir: &Path, threads: usize, resume: Option<&mut dyn FnMut(String)>) -> Result<Self> {
         let recipe = &plan.recipe;
         let made = registry.make(&recipe.env, &recipe.env_options, recipe.run.envs, Purpose::Train)?;
         let test_env = registry.make(&recipe.env, &recipe.env_options, recipe.test.episodes, Purpose::Test)?.env;
@@ -81,13 +83,13 @@ impl Trainer {
         let spec = policy_spec(&plan, &env_spec)?;
         check_best(&recipe.checkpoint.best, &env_spec)?;
         let mut collector = Collector::new(made.env, recipe.seed)?;
+        let from = match resume {
+            None => None,
+            Some(warn) => find(dir, recipe, &spec, &made.origin, &mut collector, warn)?,
+        };
         let (params, adam, state) = match from {
             None => (spec.init(recipe.seed), AdamW::new(spec.learned()), State::default()),
-            Some(c) => {
-                check_same(&c.description, &spec, &made.origin)?;
-                collector.load(&c.state.collector)?;
-                (c.params, c.adam, c.state)
-            }
+            Some(c) => (c.params, c.adam, c.state),
         };
         let compute = Compute::new(recipe.device)?;
         let shards = Shards::new(recipe.run.shards, threads)?;
@@ -103,6 +105,7 @@ impl Trainer {
             stats: state.stats,
             best: state.best,
             last_test: state.last_test,
+            last_epoch: state.last_epoch,
             plan,
         })
     }
@@ -113,9 +116,8 @@ impl Trainer {
         let per_epoch = self.plan.updates_per_epoch;
         let console = Console::new(epochs, epochs * per_epoch, self.learner.progress().updates);
         let mut metrics: [Box<dyn Logger>; 2] =
-            [Box::new(Csv::open(&self.dir.join("metrics.csv"), self.epoch)?), Box::new(TensorBoard::new(&self.dir.join("tensorboard")))];
+            [Box::new(Csv::open(&self.dir.join("metrics.csv"), self.epoch)?), Box::new(TensorBoard::new(&self.dir.join("tensorboard"))?)];
         let mut timing = Csv::open(&self.dir.join("timing.csv"), self.epoch)?;
-        let mut row = Row::new();
         while self.epoch < epochs {
             let mut clock = Clock::default();
             let begun = self.stats.updates;
@@ -128,21 +130,25 @@ impl Trainer {
                 }
             }
             let steps = (per_epoch - begun) * self.plan.recipe.run.collect_steps as u64;
-            row = self.finish_epoch(&mut clock)?;
+            let row = self.finish_epoch(&mut clock)?;
             metrics.iter_mut().try_for_each(|m| m.log(self.epoch, &row))?;
             timing.log(self.epoch, &clock.row(steps))?;
             let rate = steps as f64 / clock.total();
             let left = (epochs - self.epoch) as f64 * per_epoch as f64 * self.plan.recipe.run.collect_steps as f64 / rate;
             console.epoch(self.epoch, &row, rate, left);
-            if self.epoch.is_multiple_of(self.plan.recipe.checkpoint.every) || self.epoch == epochs || stop.load(Ordering::SeqCst) {
+            // An interruption's own checkpoint cannot be the best: a run that is not interrupted would not have it.
+            let due = self.epoch.is_multiple_of(self.plan.recipe.checkpoint.every) || self.epoch == epochs;
+            if due {
                 self.select(&row);
+            }
+            if due || stop.load(Ordering::SeqCst) {
                 self.save()?;
             }
             if stop.load(Ordering::SeqCst) && self.epoch < epochs {
                 return Ok(Outcome::Interrupted);
             }
         }
-        self.finish(&row)?;
+        self.finish()?;
         Ok(Outcome::Finished)
     }
 
@@ -183,6 +189,7 @@ impl Trainer {
             let tested = row.iter().filter(|(n, _)| n.starts_with("test_"));
             self.last_test = tested.filter_map(|(n, v)| v.map(|v| (n.clone(), v))).collect();
         }
+        self.last_epoch = row.iter().filter_map(|(n, v)| v.map(|v| (n.clone(), v))).collect();
         Ok(row)
     }
 
@@ -213,6 +220,7 @@ impl Trainer {
                 test: self.last_test.clone(),
                 files: BTreeMap::new(),
             },
+            recipe: Some(self.plan.recipe.to_toml()?),
             params: self.learner.params().to_vec(),
             adam: self.learner.adam().clone(),
             state: State {
@@ -224,20 +232,20 @@ impl Trainer {
                 learning: self.learner.progress().clone(),
                 stats: self.stats.clone(),
                 collector: self.collector.save()?,
+                last_epoch: self.last_epoch.clone(),
             },
         };
         let root = self.dir.join("checkpoints");
         checkpoint.write(&root, spec)?;
-        checkpoint::prune(&root, self.plan.recipe.checkpoint.keep, self.best.as_ref())
+        checkpoint::prune(&root, &self.plan.recipe.checkpoint, self.best.as_ref())
     }
 
     /// Packs the best policy (the last one where no test chose any) and sums the run up.
-    fn finish(&self, row: &Row) -> Result<()> {
+    fn finish(&self) -> Result<()> {
         let root = self.dir.join("checkpoints");
         let last = checkpoint::list(&root).pop().ok_or_else(|| Error::run("the run wrote no checkpoint"))?;
         let chosen = self.best.as_ref().map_or(last, |b| b.name.clone());
         export(&root.join(&chosen), &self.dir.join("policy"))?;
-        let figures: BTreeMap<_, _> = row.iter().filter_map(|(n, v)| v.map(|v| (n, v))).collect();
         let summary = serde_json::json!({
             "recipe": self.plan.recipe.name,
             "seed": self.plan.recipe.seed,
@@ -247,7 +255,7 @@ impl Trainer {
             "parameters": self.learner.params().len(),
             "policy": chosen,
             "best": self.best,
-            "last_epoch": figures,
+            "last_epoch": self.last_epoch,
         });
         let text = serde_json::to_string_pretty(&summary).map_err(|e| Error::run(format!("cannot write the summary: {e}")))?;
         Ok(write_atomic(self.dir.join("summary.json"), text.as_bytes())?)
@@ -261,14 +269,63 @@ pub fn export(from: &Path, to: &Path) -> Result<()> {
     Ok(bundle::Bundle::new(spec, &params, d.origin, trained)?.write(to)?)
 }
 
-fn check_same(d: &Description, spec: &PolicySpec, origin: &BTreeMap<String, String>) -> Result<()> {
+/// The checkpoint that the run in `dir` continues from, loaded into `collector`; clears up what a kill left half done.
+fn find(
+    dir: &Path,
+    recipe: &Recipe,
+    spec: &PolicySpec,
+    origin: &BTreeMap<String, String>,
+    collector: &mut Collector,
+    warn: &mut dyn FnMut(String),
+) -> Result<Option<Checkpoint>> {
+    let root = dir.join("checkpoints");
+    let accept = |c: &Checkpoint| {
+        let folder = root.join(c.name());
+        check_same(c, &folder, recipe, spec, origin)?;
+        collector.load(&c.state.collector).map_err(|e| egogen::Error::file(folder.join(STATE), e.to_string()).into())
+    };
+    let mut from = checkpoint::newest(&root, accept, &mut *warn)?;
+    match &mut from {
+        None => {
+            let reported = Csv::epochs(&dir.join("metrics.csv"))?;
+            if reported > recipe.checkpoint.every {
+                let what = format!("holds no checkpoint, though metrics.csv reports {reported} epochs; nothing to continue from");
+                return Err(Error::config(format!("{}: {what}", root.display())));
+            }
+            warn(format!("{}: holds no checkpoint yet; the run starts from the beginning", root.display()));
+        }
+        Some(c) => {
+            let lost = c.state.best.take_if(|b| Checkpoint::read(&root.join(&b.name)).is_err());
+            lost.inspect(|b| {
+                warn(format!("{}: the best checkpoint so far is lost; only later ones can be the best", root.join(&b.name).display()))
+            });
+        }
+    }
+    [dir, &root, &dir.join("policy")].into_iter().try_for_each(checkpoint::sweep)?;
+    Ok(from)
+}
+
+/// A run goes on only with what it began with.
+fn check_same(c: &Checkpoint, folder: &Path, recipe: &Recipe, spec: &PolicySpec, origin: &BTreeMap<String, String>) -> Result<()> {
+    let bad = |file: &str, what: String| Err(egogen::Error::file(folder.join(file), what).into());
+    if let Some(text) = &c.recipe {
+        let theirs = Recipe::parse(&folder.join(RECIPE).display().to_string(), text, &[])?;
+        if let Some((key, [was, is])) = difference(&theirs, recipe)? {
+            return bad(RECIPE, format!("is of another run: {key} is {was}, expected {is}"));
+        }
+    }
+    let d = &c.description;
+    if (&d.recipe, d.seed) != (&recipe.name, recipe.seed) {
+        let what = format!("is of another run: '{}' with seed {}, expected '{}' with seed {}", d.recipe, d.seed, recipe.name, recipe.seed);
+        return bad(DESCRIPTION, what);
+    }
     if d.layout != spec.layout || d.policy != spec.config || d.action != spec.action {
-        return Err(Error::config("the run's checkpoints hold a policy of other sizes than its recipe and environment ask for"));
+        return bad(DESCRIPTION, "holds a policy of other sizes than the recipe and its environment ask for".into());
     }
     match origin.iter().find(|(name, hash)| d.origin.get(*name) != Some(hash)) {
         Some((name, hash)) => {
             let was = d.origin.get(name).map_or("nothing", String::as_str);
-            Err(Error::config(format!("the run was trained on {name} {was}, but {name} {hash} is here now")))
+            bad(DESCRIPTION, format!("was trained on {name} {was}, but {name} {hash} is here now"))
         }
         None => Ok(()),
     }

@@ -6,6 +6,7 @@ pub mod agent;
 pub mod body;
 pub mod device;
 pub mod error;
+pub mod export;
 pub mod io;
 pub mod kernels;
 pub mod metrics;

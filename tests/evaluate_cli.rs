@@ -38,6 +38,14 @@ fn episodes_become_pictures() {
         assert!(bytes.starts_with(b"\x89PNG") && bytes.len() > 5000, "{name}");
     }
     assert!(!dir.path().join("pictures/start-001-film.png").exists());
+    // The motion beside them, as long in one form as in the other.
+    let path = dir.path().join("pictures/start-000.npz");
+    let frames = egogen::motion::amass::read_amass(&path, "start", None).unwrap().frames.len();
+    let bytes = std::fs::read(path.with_extension("glb")).unwrap();
+    let size = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
+    let json: serde_json::Value = serde_json::from_slice(&bytes[20..20 + size]).unwrap();
+    let times = json["animations"][0]["samplers"][0]["input"].as_u64().unwrap() as usize;
+    assert_eq!(json["accessors"][times]["count"], frames);
 }
 
 #[test]

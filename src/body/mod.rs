@@ -9,6 +9,7 @@ pub use frame::{Frame, canonical_frame};
 pub use model::BodyModel;
 pub use shaped::{Posed, ShapedBody, local_rotations};
 
+use crate::{Error, Result};
 use std::ops::Range;
 
 /// Joints of a body: SMPL-X's 22 body joints, then the left and the right eye.
@@ -33,6 +34,13 @@ pub const POSE: Range<usize> = 6..69;
 pub const HANDS: Range<usize> = 69..93;
 /// Parent of each joint; the pelvis is its own root.
 pub const PARENTS: [usize; JOINTS] = [0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15];
+/// SMPL-X's names of the joints.
+#[rustfmt::skip]
+pub const JOINT_NAMES: [&str; JOINTS] = [
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle", "spine3", "left_foot",
+    "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow",
+    "left_wrist", "right_wrist", "left_eye_smplhf", "right_eye_smplhf",
+];
 /// Indices of the foot markers RHEE, RTOE, RRSTBEEF, LHEE, LTOE, LRSTBEEF in the SSM2 order.
 pub const FOOT_MARKERS: [usize; 6] = [47, 60, 55, 16, 30, 25];
 
@@ -51,6 +59,22 @@ pub mod joint {
     pub const HEAD: usize = 15;
     pub const L_EYE: usize = 22;
     pub const R_EYE: usize = 23;
+}
+
+/// Refuses a motion (T x 93 parameters) that has no whole number of frames or none, a shape of other than 10 coefficients, and
+/// values that are not finite.
+pub fn check_motion(frames: &[f32], betas: &[f32]) -> Result<()> {
+    if frames.is_empty() || !frames.len().is_multiple_of(PARAMS) || betas.len() != BETAS {
+        let what = format!("{} frame values and {} betas, expected a multiple of {PARAMS} and {BETAS}", frames.len(), betas.len());
+        return Err(Error::invalid(what));
+    }
+    if let Some(i) = frames.iter().position(|v| !v.is_finite()) {
+        return Err(Error::invalid(format!("frame {} holds a value that is not finite", i / PARAMS)));
+    }
+    match betas.iter().position(|v| !v.is_finite()) {
+        Some(i) => Err(Error::invalid(format!("beta {i} is not finite"))),
+        None => Ok(()),
+    }
 }
 
 #[cfg(test)]

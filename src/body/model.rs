@@ -112,6 +112,11 @@ impl BodyModel {
         &self.markers
     }
 
+    /// The four bones of each vertex and their weights, which sum to 1.
+    pub fn skinning(&self) -> impl ExactSizeIterator<Item = ([usize; BONES], [f32; BONES])> + '_ {
+        self.skin.iter().map(|s| (s.bone, s.weight))
+    }
+
     /// Rest joints of the mean shape.
     pub fn joints_template(&self) -> &[Vec3; JOINTS] {
         &self.joints

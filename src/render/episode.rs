@@ -1,8 +1,9 @@
 //! A recorded episode in pictures: people walking among boxes as a filmstrip, as ghosts and from above.
 
+use super::colour::PEOPLE;
 use super::top_view::PATH_WIDTH;
 use super::{Camera, Image, Mesh, Rgb, Shading, Stage, TopView, colour, film, ramp};
-use crate::body::{BETAS, BodyModel, FOOT_MARKERS, MARKER_DIM, PARAMS, ShapedBody, joint};
+use crate::body::{BodyModel, FOOT_MARKERS, MARKER_DIM, PARAMS, ShapedBody, check_motion, joint};
 use crate::motion::FPS;
 use crate::scene::Scene;
 use crate::{Error, Result};
@@ -14,8 +15,6 @@ const STANCE_HEIGHT: f32 = 0.08;
 const STANCE_SPEED: f32 = 0.2;
 /// Height of the person that the camera makes room for, metres.
 const HEAD_ROOM: f32 = 1.9;
-/// Colours of several people.
-const PEOPLE: [Rgb; 6] = [colour::BLUE, colour::ORANGE, colour::GREEN, colour::RED, [124, 84, 170], [70, 160, 170]];
 
 /// One person's part of an episode.
 #[derive(Clone, Copy, Debug)]
@@ -179,13 +178,7 @@ impl<'a> Episode<'a> {
 impl<'a> Track<'a> {
     fn new(model: &BodyModel, walker: &'a Walker<'a>) -> Result<Self> {
         let (frames, betas) = (walker.frames, walker.betas);
-        if frames.is_empty() || !frames.len().is_multiple_of(PARAMS) || betas.len() != BETAS {
-            let what = format!("{} frame values and {} betas, expected a multiple of {PARAMS} and {BETAS}", frames.len(), betas.len());
-            return Err(Error::invalid(what));
-        }
-        if let Some(i) = frames.iter().chain(betas).position(|v| !v.is_finite()) {
-            return Err(Error::invalid(format!("frame {} holds a value that is not finite", i / PARAMS)));
-        }
+        check_motion(frames, betas)?;
         let body = model.shape(betas);
         let pelvis = frames.chunks_exact(PARAMS).map(|f| body.pose(f).pos[joint::PELVIS]).collect();
         Ok(Self { walker, body, pelvis })
@@ -225,6 +218,7 @@ fn moment(i: usize, count: usize, frames: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::body::BETAS;
     use crate::body::tests::toy;
     use crate::scene::BoxObstacle;
 

@@ -33,4 +33,6 @@ pub mod colour {
     pub const RED: Rgb = [204, 63, 54];
     pub const GREEN: Rgb = [52, 142, 84];
     pub const ORANGE: Rgb = [230, 140, 30];
+    /// Of several people, from the first.
+    pub const PEOPLE: [Rgb; 6] = [BLUE, ORANGE, GREEN, RED, [124, 84, 170], [70, 160, 170]];
 }

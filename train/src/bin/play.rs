@@ -1,8 +1,10 @@
-//! The program `play`: a policy in its task, as pictures.
+//! The program `play`: a policy in its task, as pictures and as motion for other programs.
 
 use clap::Parser;
 use egogen::agent::bundle::Bundle;
 use egogen::body::BodyModel;
+use egogen::export::write_glb;
+use egogen::motion::amass::write_amass;
 use egogen::render::{Episode, Image, Walker, tile};
 use egogen_envs::motion::MotionEnv;
 use egogen_train::evaluate::{Actor, Film, Greedy, Played, play};
@@ -12,7 +14,8 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// Draws episodes of a policy (or of a baseline): a filmstrip and a picture from above of each, and all of them from above.
+/// Draws episodes of a policy (or of a baseline): all of them from above; of the first, filmstrips and the motion itself as glTF
+/// and in AMASS's layout.
 #[derive(Debug, Parser)]
 #[command(
     name = "play",
@@ -27,7 +30,7 @@ struct Args {
     /// Starts 0 to this, less one, are played
     #[arg(long, default_value = "12")]
     starts: NonZeroUsize,
-    /// Of those, this many also get a filmstrip
+    /// Of those, this many also get a filmstrip and their motion as start-NNN.glb and start-NNN.npz
     #[arg(long, default_value_t = 2)]
     films: usize,
     /// Seed of the starts and of the noise
@@ -42,7 +45,7 @@ struct Args {
     /// Change a value of the walking task, e.g. scene.kind=open; repeatable
     #[arg(long = "set", value_name = "KEY.PATH=VALUE")]
     set: Vec<String>,
-    /// Folder for the pictures
+    /// Folder for the pictures and the motion
     #[arg(long, value_name = "DIR", default_value = "runs/play")]
     out: PathBuf,
 }
@@ -74,6 +77,9 @@ fn run(args: &Args) -> Result<u8> {
             plans.push(episode.top_view(body, 320)?);
             if (p.start as usize) < args.films {
                 strips(&episode, body, p, &args.out)?;
+                let file = |kind: &str| args.out.join(format!("start-{:03}.{kind}", p.start));
+                write_glb(file("glb"), body, &episode)?;
+                write_amass(file("npz"), &film.frames, &film.betas)?;
             }
             Ok(())
         })?;

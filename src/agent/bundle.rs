@@ -2,27 +2,27 @@
 //! where the policy normalises observations).
 //!
 //! The JSON names the observation layout, the sizes, the log-variance clamp, the hashes of what the policy stands on (motion model,
-//! body) and a golden pair: outputs for a fixed input, computed again whenever the bundle is read.
+//! body) and a golden pair: one observation and what the network says of it, computed again whenever the bundle is read.
 
 use super::{ActionSpace, Network, ObsLayout, PolicyConfig, PolicySpec};
 use crate::io::{Precision, Tensors, pack_tensors, write_atomic};
+use crate::kernels::PolicyEngine;
 use crate::rng::stream;
 use crate::{Error, Result};
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Device;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 
-const FORMAT: u32 = 1;
+const FORMAT: u32 = 2;
 /// File names within the folder.
 pub const DESCRIPTION: &str = "policy.json";
 pub const WEIGHTS: &str = "policy.safetensors";
-/// Observations of the golden pair.
-const GOLDEN: usize = 2;
-/// Outputs may differ by this much (times 1 + their size) from one machine or device to another.
-const TOLERANCE: f32 = 1e-3;
+/// Outputs may differ by this much (times 1 + their size) from one machine or implementation to another.
+const TOLERANCE: f32 = 1e-4;
 
 /// Where a policy comes from.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -50,13 +50,23 @@ struct Description {
     golden: Golden,
 }
 
-/// Outputs for [`GOLDEN`] rows of normal noise from stream (0, "golden observations").
+/// An observation and the network's outputs for it, from the weights as the file holds them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Golden {
+    /// One row, in the order of the layout.
+    obs: Vec<f32>,
+    /// Means of the action, or logits of a discrete one.
     mu: Vec<f32>,
+    /// Clamped; empty for discrete actions.
     logvar: Vec<f32>,
-    value: Vec<f32>,
+    value: f32,
+}
+
+/// What is read before all else, so that other formats are told by their number.
+#[derive(Deserialize)]
+struct Version {
+    format: u32,
 }
 
 /// A policy ready to act, and what it stands on.
@@ -92,8 +102,8 @@ impl Bundle {
             action: self.spec.action,
             origin: self.origin.clone(),
             trained: self.trained.clone(),
-            weights: crate::io::content_hash(&self.bytes),
-            golden: self.golden(),
+            weights: self.weights_hash(),
+            golden: self.golden(self.golden_obs())?,
         };
         write_atomic(dir.join(WEIGHTS), &self.bytes)?;
         let text = serde_json::to_string_pretty(&description).map_err(|e| Error::invalid(format!("cannot describe the policy: {e}")))?;
@@ -104,10 +114,13 @@ impl Bundle {
     pub fn read(dir: &Path) -> Result<Self> {
         let path = dir.join(DESCRIPTION);
         let text = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
-        let d: Description = serde_json::from_str(&text).map_err(|e| Error::file(&path, e.to_string()))?;
-        if d.format != FORMAT {
-            return Err(Error::file(&path, format!("format is {}, expected {FORMAT}", d.format)));
+        let bad = |e: serde_json::Error| Error::file(&path, e.to_string());
+        let Version { format } = serde_json::from_str(&text).map_err(bad)?;
+        if format != FORMAT {
+            let what = format!("format is {format}, expected {FORMAT}: export it again from its run (`export RUN --out DIR`)");
+            return Err(Error::file(&path, what));
         }
+        let d: Description = serde_json::from_str(&text).map_err(bad)?;
         let spec = PolicySpec::new(d.policy, d.layout, d.action).map_err(|e| Error::file(&path, e.to_string()))?;
         let weights = dir.join(WEIGHTS);
         let bytes = std::fs::read(&weights).map_err(|e| Error::io(&weights, e))?;
@@ -131,32 +144,84 @@ impl Bundle {
         }
     }
 
+    /// The weights for a policy of these sizes; refused, naming the first difference, when this one has others.
+    pub fn weights_for(&self, spec: &PolicySpec) -> Result<Vec<f32>> {
+        let value = |s: &PolicySpec| serde_json::json!({"observation": s.layout, "policy": s.config, "action": s.action});
+        match difference("", &value(spec), &value(&self.spec)) {
+            Some(what) => Err(Error::invalid(what)),
+            None => Ok(self.params.clone()),
+        }
+    }
+
     /// The policy on `device`.
     pub fn network(&self, device: &Device) -> Network {
         Network::new(&self.spec, &self.params, device)
     }
 
-    fn golden(&self) -> Golden {
-        let rows = GOLDEN * self.spec.layout.dim();
-        let obs: Vec<f32> = StandardNormal.sample_iter(stream(0, "golden observations", 0)).take(rows).collect();
-        let out = self.network(&Device::flex()).forward(&obs);
-        Golden { mu: floats(out.mu), logvar: out.logvar.map(floats).unwrap_or_default(), value: floats(out.value) }
+    /// Content hash of the weights' file.
+    pub fn weights_hash(&self) -> String {
+        crate::io::content_hash(&self.bytes)
+    }
+
+    /// Normal noise from stream (0, "golden observations"), spread like the observations where the policy knows how they are.
+    fn golden_obs(&self) -> Vec<f32> {
+        let dim = self.spec.layout.dim();
+        let mut obs: Vec<f32> = StandardNormal.sample_iter(stream(0, "golden observations", 0)).take(dim).collect();
+        let (mean, std) = self.params[self.spec.obs_norm_range()].split_at(self.spec.obs_norm_range().len() / 2);
+        obs.iter_mut().zip(mean.iter().zip(std)).for_each(|(x, (m, s))| *x = m + s * *x);
+        obs
+    }
+
+    fn golden(&self, obs: Vec<f32>) -> Result<Golden> {
+        let engine = PolicyEngine::new(&self.spec, &self.params)?;
+        let mut out = vec![0.0; engine.output_dim()];
+        engine.forward(&obs, &mut out)?;
+        let value = out.pop().unwrap_or_default();
+        let logvar = out.split_off(self.spec.action.count());
+        Ok(Golden { obs, mu: out, logvar, value })
     }
 
     fn check_golden(&self, path: &Path, want: &Golden) -> Result<()> {
-        let have = self.golden();
-        for (name, have, want) in [("mu", have.mu, &want.mu), ("logvar", have.logvar, &want.logvar), ("value", have.value, &want.value)] {
+        let dim = self.spec.layout.dim();
+        if want.obs.len() != dim {
+            return Err(Error::file(path, format!("golden.obs has {} numbers, the layout has {dim}", want.obs.len())));
+        }
+        let have = self.golden(want.obs.clone())?;
+        let parts: [(&str, &[f32], &[f32]); 3] =
+            [("mu", &have.mu, &want.mu), ("logvar", &have.logvar, &want.logvar), ("value", &[have.value], &[want.value])];
+        for (name, have, want) in parts {
+            if have.len() != want.len() {
+                return Err(Error::file(path, format!("golden.{name} has {} numbers, expected {}", want.len(), have.len())));
+            }
             let near = |(h, w): (&f32, &f32)| (h - w).abs() <= TOLERANCE * (1.0 + w.abs());
-            if have.len() != want.len() || !have.iter().zip(want).all(near) {
-                return Err(Error::file(path, format!("golden.{name} is not what the policy computes here; the policy cannot be trusted")));
+            if let Some(i) = have.iter().zip(want).position(|pair| !near(pair)) {
+                return Err(Error::file(
+                    path,
+                    format!(
+                        "golden.{name}[{i}] is {}, but the policy computes {} here (tolerance {TOLERANCE} x (1 + size)): the golden pair \
+                         does not fit the weights, and the policy cannot be trusted",
+                        want[i], have[i]
+                    ),
+                ));
             }
         }
         Ok(())
     }
 }
 
-fn floats<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().iter::<f32>().collect()
+/// The first entry in which what is wanted differs from what a bundle has.
+fn difference(path: &str, wanted: &Value, has: &Value) -> Option<String> {
+    let at = |key: &str| if path.is_empty() { key.to_string() } else { format!("{path}.{key}") };
+    match (wanted, has) {
+        (Value::Object(w), Value::Object(h)) => {
+            let keys: BTreeSet<&String> = w.keys().chain(h.keys()).collect();
+            keys.into_iter().find_map(|k| difference(&at(k), w.get(k).unwrap_or(&Value::Null), h.get(k).unwrap_or(&Value::Null)))
+        }
+        (Value::Array(w), Value::Array(h)) if w.len() == h.len() => {
+            w.iter().zip(h).enumerate().find_map(|(i, (w, h))| difference(&at(&i.to_string()), w, h))
+        }
+        _ => (wanted != has).then(|| format!("{path} is {wanted} here, {has} in the bundle")),
+    }
 }
 
 #[cfg(test)]
@@ -184,6 +249,15 @@ mod tests {
         read.require("motion", "m1").unwrap();
         assert!(read.require("motion", "m2").unwrap_err().to_string().contains("trained on motion m1"));
         assert!(read.require("body", "b").is_err());
+        assert_eq!(read.weights_for(&written.spec).unwrap(), written.params);
+        let other = |config: &str, action: usize| {
+            let spec = PolicySpec::new(serde_json::from_str(config).unwrap(), written.spec.layout.clone(), action).unwrap();
+            read.weights_for(&spec).unwrap_err().to_string()
+        };
+        let error = other(r#"{"gru": {"state": 7}, "octaves": 3}"#, 4);
+        assert!(error.contains("policy.gru.state is 7 here, 6 in the bundle"), "{error}");
+        let error = other(r#"{"gru": {"state": 6}, "octaves": 3}"#, 5);
+        assert!(error.contains("action is 5 here, 4 in the bundle"), "{error}");
     }
 
     #[test]
@@ -200,9 +274,25 @@ mod tests {
             assert!(error.contains(word), "{error}");
         };
         refused(&|t| t.replacen("\"version\": 1", "\"version\": 2", 1), "layout version 2");
-        refused(&|t| t.replacen("\"format\": 1", "\"format\": 9", 1), "format is 9");
+        refused(&|t| t.replacen("\"format\": 2", "\"format\": 9", 1), "format is 9");
+        refused(&|_| "{\"format\": 1, \"golden\": {}}".into(), "export it again");
         // Another clamp gives other outputs; the weights are the same.
-        refused(&|t| t.replacen("-2.5", "-0.01", 1).replacen("2.5\n", "0.01\n", 1), "golden.logvar");
+        refused(&|t| t.replacen("-2.5", "-1e-4", 1).replacen("2.5\n", "1e-4\n", 1), "golden.logvar");
+        let golden = |part: &'static str, value: serde_json::Value| {
+            move |text: String| {
+                let mut d: serde_json::Value = serde_json::from_str(&text).unwrap();
+                d["golden"][part] = value.clone();
+                d.to_string()
+            }
+        };
+        // Well beyond the tolerance.
+        let want = bundle().golden(bundle().golden_obs()).unwrap();
+        refused(&golden("value", (want.value + 3e-4 * (1.0 + want.value.abs())).into()), "golden.value[0]");
+        refused(&golden("mu", vec![0.0; 3].into()), "golden.mu has 3 numbers, expected 4");
+        refused(&golden("obs", vec![0.0; 10].into()), "golden.obs has 10 numbers, the layout has 11");
+        let mut obs = want.obs;
+        obs.reverse();
+        refused(&golden("obs", obs.into()), "golden.mu");
         bundle().write(dir.path()).unwrap();
         let weights = dir.path().join(WEIGHTS);
         let mut bytes = std::fs::read(&weights).unwrap();

@@ -1,13 +1,14 @@
 //! The program `train`.
 
 use crate::checkpoint::is_leftover;
-use crate::program::{self, INTERRUPTED};
+use crate::program::{self, Given, INTERRUPTED};
 use crate::recipe::{EMBEDDED, Plan, Recipe, of_run};
 use crate::registry::{Purpose, Registry};
-use crate::trainer::{Outcome, Trainer, policy_spec};
+use crate::trainer::{Outcome, Trainer, initial, policy_spec};
 use crate::{Error, Result};
 use clap::Parser;
 use egogen::agent::ActionSpace;
+use egogen::agent::bundle::Bundle;
 use std::fs::DirEntry;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -24,6 +25,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
   train point --set run.epochs=4          a recipe with a changed value
   train my.toml --out runs/mine --seed 3  a recipe of your own
   train --resume runs/mine                continue bit for bit where it stopped
+  train my.toml --init runs/mine/policy   start from the weights of a trained policy
   train paper --dry-run                   show what would be done
 
 Exit codes: 0 done, 1 failed while running, 2 bad usage or recipe, 130 interrupted (after saving)."
@@ -50,6 +52,9 @@ struct Args {
     /// Continue the run in this folder; can change only run.epochs, checkpoint.* and test.*
     #[arg(long, value_name = "DIR", conflicts_with_all = ["recipe", "out", "seed", "list"])]
     resume: Option<PathBuf>,
+    /// Start from the weights of this policy bundle; its network must be the recipe's
+    #[arg(long, value_name = "POLICY_DIR", conflicts_with_all = ["resume", "list"])]
+    init: Option<PathBuf>,
     /// Threads to use; results do not depend on it [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -80,16 +85,18 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
     };
     recipe.seed = args.seed.unwrap_or(recipe.seed);
     let plan = recipe.plan()?;
-    if args.dry_run {
-        return describe(&plan, registry);
-    }
+    // Before anything computes, and reading a bundle does.
     let threads = start_threads(args.threads)?;
+    let init = args.init.as_deref().map(Bundle::read).transpose().given()?;
+    if args.dry_run {
+        return describe(&plan, registry, init.as_ref());
+    }
     let mut trainer = match &args.resume {
         Some(dir) => Trainer::resume(plan, registry, dir, threads, |what| eprintln!("warning: {what}"))?,
         None => {
             let dir = run_folder(args.out.as_deref(), &plan.recipe.name)?;
             eprintln!("training '{}' into {}", plan.recipe.name, dir.display());
-            Trainer::start(plan, registry, &dir, threads)?
+            Trainer::start(plan, registry, &dir, threads, init.as_ref())?
         }
     };
     let stop = Arc::new(AtomicBool::new(false));
@@ -135,10 +142,11 @@ fn run_folder(given: Option<&Path>, name: &str) -> Result<PathBuf> {
     }
 }
 
-fn describe(plan: &Plan, registry: &Registry) -> Result<u8> {
+fn describe(plan: &Plan, registry: &Registry, init: Option<&Bundle>) -> Result<u8> {
     let recipe = &plan.recipe;
     let made = registry.make(&recipe.env, &recipe.env_options, 1, Purpose::Test)?;
     let spec = policy_spec(plan, made.env.spec())?;
+    init.map(|bundle| initial(bundle, &spec, &made.origin)).transpose()?;
     let per_epoch = plan.updates_per_epoch * recipe.run.collect_steps as u64;
     println!("{}", recipe.to_toml()?);
     let action = match spec.action {

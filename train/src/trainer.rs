@@ -4,14 +4,15 @@ use crate::checkpoint::{self, Best, Checkpoint, DESCRIPTION, Description, RECIPE
 use crate::collector::{Collector, test_episodes};
 use crate::logger::{Console, Csv, Logger};
 use crate::policy::Compute;
-use crate::ppo::{Learner, Rules};
+use crate::ppo::{Learner, Progress, Rules};
 use crate::recipe::{Plan, Recipe, difference};
 use crate::registry::{Purpose, Registry};
 use crate::shards::Shards;
 use crate::stats::{Episodes, EpochStats, Row};
 use crate::tensorboard::TensorBoard;
-use crate::{AdamW, Error, Result};
-use egogen::agent::{ObsLayout, PolicySpec, bundle};
+use crate::{AdamW, Error, Result, Running};
+use egogen::agent::bundle::{Bundle, Trained};
+use egogen::agent::{ObsLayout, PolicySpec};
 use egogen::io::write_atomic;
 use egogen_envs::{ActionSpace, EnvSpec, VecEnv};
 use std::collections::BTreeMap;
@@ -27,6 +28,9 @@ pub enum Outcome {
     /// Stopped from outside, after saving.
     Interrupted,
 }
+
+/// Entry of a policy's origin: content hash of the weights that its training began with, where they came from a bundle.
+const INIT: &str = "init";
 
 /// A run in its folder.
 pub struct Trainer {
@@ -58,15 +62,26 @@ pub fn policy_spec(plan: &Plan, env: &EnvSpec) -> Result<PolicySpec> {
         .map_err(|e| Error::config(format!("recipe '{}': {e}", plan.recipe.name)))
 }
 
+/// What a run begins from.
+enum Start<'a> {
+    Seed,
+    Policy(&'a Bundle),
+    /// The run's newest checkpoint; the function hears of those that cannot be used.
+    Resume(&'a mut dyn FnMut(String)),
+}
+
 impl Trainer {
-    /// Starts a run in the new folder `dir`.
-    pub fn start(plan: Plan, registry: &Registry, dir: &Path, threads: usize) -> Result<Self> {
-        Self::build(plan, registry, dir, threads, None)?.note_recipe()
+    /// Starts a run in the new folder `dir`; from the weights of the policy `init`, where one is given.
+    pub fn start(plan: Plan, registry: &Registry, dir: &Path, threads: usize, init: Option<&Bundle>) -> Result<Self> {
+        let run = Self::build(plan, registry, dir, threads, init.map_or(Start::Seed, Start::Policy))?.note_recipe()?;
+        // Resuming knows no other way to these weights.
+        init.map_or(Ok(()), |_| run.save())?;
+        Ok(run)
     }
 
     /// Continues the run in `dir` from its newest usable checkpoint, or from the start where it was killed before the first.
     pub fn resume(plan: Plan, registry: &Registry, dir: &Path, threads: usize, mut warn: impl FnMut(String)) -> Result<Self> {
-        Self::build(plan, registry, dir, threads, Some(&mut warn))?.note_recipe()
+        Self::build(plan, registry, dir, threads, Start::Resume(&mut warn))?.note_recipe()
     }
 
     fn note_recipe(self) -> Result<Self> {
@@ -74,8 +89,7 @@ impl Trainer {
         Ok(self)
     }
 
-    /// `resume`: hears of checkpoints in `dir` that cannot be used; `None` for a new run.
-    fn build(plan: Plan, registry: &Registry, dir: &Path, threads: usize, resume: Option<&mut dyn FnMut(String)>) -> Result<Self> {
+    fn build(plan: Plan, registry: &Registry, dir: &Path, threads: usize, start: Start) -> Result<Self> {
         let recipe = &plan.recipe;
         let made = registry.make(&recipe.env, &recipe.env_options, recipe.run.envs, Purpose::Train)?;
         let test_env = registry.make(&recipe.env, &recipe.env_options, recipe.test.episodes, Purpose::Test)?.env;
@@ -83,20 +97,31 @@ impl Trainer {
         let spec = policy_spec(&plan, &env_spec)?;
         check_best(&recipe.checkpoint.best, &env_spec)?;
         let mut collector = Collector::new(made.env, recipe.seed)?;
-        let from = match resume {
-            None => None,
-            Some(warn) => find(dir, recipe, &spec, &made.origin, &mut collector, warn)?,
+        let mut origin = made.origin;
+        let (from, init) = match start {
+            Start::Seed => (None, None),
+            Start::Policy(bundle) => (None, Some(bundle)),
+            Start::Resume(warn) => (find(dir, recipe, &spec, &origin, &mut collector, warn)?, None),
         };
-        let (params, adam, state) = match from {
-            None => (spec.init(recipe.seed), AdamW::new(spec.learned()), State::default()),
-            Some(c) => (c.params, c.adam, c.state),
+        let (params, adam, state) = match (from, init) {
+            (Some(c), _) => {
+                origin = c.description.origin;
+                (c.params, c.adam, c.state)
+            }
+            (None, Some(bundle)) => {
+                let params = initial(bundle, &spec, &origin)?;
+                origin.insert(INIT.into(), bundle.weights_hash());
+                let learning = Progress { obs: seen(bundle), ..Progress::default() };
+                (params, AdamW::new(spec.learned()), State { learning, ..State::default() })
+            }
+            (None, None) => (spec.init(recipe.seed), AdamW::new(spec.learned()), State::default()),
         };
         let compute = Compute::new(recipe.device)?;
         let shards = Shards::new(recipe.run.shards, threads)?;
         Ok(Self {
             learner: Learner::new(spec, compute, shards, params, adam, state.learning)?,
             dir: dir.into(),
-            origin: made.origin,
+            origin,
             env_spec,
             collector,
             test_env,
@@ -265,8 +290,25 @@ impl Trainer {
 /// Packs the policy of the checkpoint folder `from` into the bundle folder `to`.
 pub fn export(from: &Path, to: &Path) -> Result<()> {
     let (d, spec, params) = Checkpoint::read_policy(from)?;
-    let trained = bundle::Trained { recipe: d.recipe, seed: d.seed, epoch: d.epoch, env_steps: d.env_steps, test: d.test };
-    Ok(bundle::Bundle::new(spec, &params, d.origin, trained)?.write(to)?)
+    let trained = Trained { recipe: d.recipe, seed: d.seed, epoch: d.epoch, env_steps: d.env_steps, test: d.test };
+    Ok(Bundle::new(spec, &params, d.origin, trained)?.write(to)?)
+}
+
+/// What a bundle knows of observations, as if counted here.
+fn seen(bundle: &Bundle) -> Vec<Running> {
+    let norm = &bundle.params[bundle.spec.obs_norm_range()];
+    let (mean, std) = norm.split_at(norm.len() / 2);
+    let count = bundle.trained.env_steps as f64;
+    let one = |(&m, &s): (&f32, &f32)| Running { mean: f64::from(m), variance: f64::from(s).powi(2), count };
+    mean.iter().zip(std).map(one).collect()
+}
+
+/// The weights of `bundle` for a policy of these sizes that stands on `origin`.
+pub(crate) fn initial(bundle: &Bundle, spec: &PolicySpec, origin: &BTreeMap<String, String>) -> Result<Vec<f32>> {
+    let bad = |e: egogen::Error| Error::config(format!("--init: {e}"));
+    let params = bundle.weights_for(spec).map_err(bad)?;
+    origin.iter().try_for_each(|(what, hash)| bundle.require(what, hash)).map_err(bad)?;
+    Ok(params)
 }
 
 /// The checkpoint that the run in `dir` continues from, loaded into `collector`; clears up what a kill left half done.

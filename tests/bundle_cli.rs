@@ -91,3 +91,12 @@ fn training_begins_from_a_policy() {
         assert!(!never.exists());
     }
 }
+
+#[test]
+fn a_run_that_explodes_says_what_did() {
+    let dir = tempfile::tempdir().unwrap();
+    let output = train(&dir.path().join("run"), &["--set", "adam.lr=1e30"]);
+    assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
+    let text = stderr(&output);
+    assert!(text.contains("became") && text.contains("adam.lr") && text.contains("no checkpoint was written before"), "{text}");
+}

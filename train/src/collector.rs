@@ -3,7 +3,7 @@
 use crate::acts::Acts;
 use crate::policy::Policy;
 use crate::{Error, Result};
-use egogen_envs::{StepResult, VecEnv};
+use egogen_envs::{EnvSpec, StepResult, VecEnv};
 use serde::{Deserialize, Serialize};
 
 /// One finished episode.
@@ -74,6 +74,7 @@ impl Collector {
     pub fn new(mut env: Box<dyn VecEnv>, seed: u64) -> Result<Self> {
         let mut obs = Vec::new();
         env.reset(seed, &mut obs)?;
+        check_obs(env.spec(), &obs)?;
         let progress = Progress { steps: 0, running: vec![(0.0, 0); env.num_envs()] };
         Ok(Self { env, seed, obs, result: StepResult::default(), progress })
     }
@@ -120,8 +121,8 @@ impl Collector {
 
     fn take_result(&mut self, out: &mut Rollout) -> Result<()> {
         let result = &self.result;
-        check_finite("reward", &result.reward)?;
-        check_finite("observation", &result.obs)?;
+        let at = self.progress.steps + 1;
+        check_result(self.env.spec(), result).map_err(|e| Error::run(format!("in step {at} of collection: {e}")))?;
         out.reward.extend_from_slice(&result.reward);
         out.terminated.extend_from_slice(&result.terminated);
         out.truncated.extend_from_slice(&result.truncated);
@@ -161,9 +162,37 @@ impl Collector {
     }
 }
 
-fn check_finite(what: &str, values: &[f32]) -> Result<()> {
+/// Refuses a step's results that are not finite, naming the figure and the environment. Terms come before the reward that they
+/// add up to.
+fn check_result(spec: &EnvSpec, result: &StepResult) -> Result<()> {
+    let named = |kind: &str, names: &[String], values: &[f32]| check_finite(names.len(), values, |k| format!("{kind} '{}'", names[k]));
+    named("the figure", &spec.info, &result.info)?;
+    check_finite(1, &result.reward, |_| "reward".into())?;
+    check_obs(spec, &result.final_obs)?;
+    check_obs(spec, &result.obs)?;
+    named("the episode's figure", &spec.episode, &result.episode)
+}
+
+/// [`check_result`] of observations alone.
+fn check_obs(spec: &EnvSpec, obs: &[f32]) -> Result<()> {
+    check_finite(spec.obs_dim(), obs, |k| {
+        let mut at = k;
+        let group = spec.obs.iter().find(|g| {
+            let inside = at < g.len();
+            at -= if inside { 0 } else { g.len() };
+            inside
+        });
+        group.map_or_else(|| format!("observation {k}"), |g| format!("observation '{}' (entry {at})", g.name))
+    })
+}
+
+/// `width` numbers of each environment; `name` says what the k-th is.
+fn check_finite(width: usize, values: &[f32], name: impl Fn(usize) -> String) -> Result<()> {
     match values.iter().position(|v| !v.is_finite()) {
-        Some(i) => Err(Error::run(format!("the environment returned {what} {} at entry {i}", values[i]))),
+        Some(i) => {
+            let (env, k) = (i / width.max(1), i % width.max(1));
+            Err(Error::run(format!("environment {env} returned {} for {}", values[i], name(k))))
+        }
         None => Ok(()),
     }
 }
@@ -175,10 +204,12 @@ pub fn test_episodes(env: &mut dyn VecEnv, policy: &Policy, seed: u64, noise: bo
     let mut running = vec![(0.0, 0); envs];
     let mut done: Vec<Option<Episode>> = vec![None; envs];
     env.reset(seed, &mut obs)?;
+    check_obs(env.spec(), &obs)?;
     for step in 0.. {
         let acts = policy.act(&obs)?;
         let actions = if noise { acts.sample(seed, "test actions", step) } else { acts.best() };
         env.step(&actions, &mut result)?;
+        check_result(env.spec(), &result).map_err(|e| Error::run(format!("in step {} of the test: {e}", step + 1)))?;
         for i in (0..envs).filter(|&i| done[i].is_none()).collect::<Vec<_>>() {
             running[i].0 += result.reward[i];
             running[i].1 += 1;

@@ -130,6 +130,19 @@ pub(crate) struct Targets {
     pub returns: Vec<f32>,
 }
 
+impl Targets {
+    /// Refuses numbers that are not finite, naming what they are of.
+    fn check_finite(&self, update: u64) -> Result<()> {
+        let all = [("value", &self.value), ("advantage", &self.advantage), ("return", &self.returns)];
+        for (name, values) in all {
+            if let Some(v) = values.iter().find(|v| !v.is_finite()) {
+                return Err(Error::run(format!("{name} became {v} in update {update}, before it reached the weights")));
+            }
+        }
+        Ok(())
+    }
+}
+
 /// Everything that learns: parameters, moments, and the policy that acts with the parameters.
 pub struct Learner {
     spec: PolicySpec,
@@ -180,6 +193,7 @@ impl Learner {
         let ppo = &PpoConfig { clip, ..*rules.ppo };
         let mut lr = rules.adam.schedule.begin(rules.adam.lr, self.progress.learning_rate, done);
         let mut targets = self.targets(rollout, rollout.value.clone(), &rollout.next_value, rules);
+        targets.check_finite(self.progress.updates + 1)?;
         let mut stats = UpdateStats { explained_variance: explained_variance(&targets.returns, &targets.value), ..Default::default() };
         let mut order: Vec<usize> = (0..targets.returns.len()).collect();
         let mut rng = stream(rules.seed, "minibatches", self.progress.updates);
@@ -187,6 +201,7 @@ impl Learner {
         'passes: for pass in 0..ppo.passes {
             if pass > 0 && ppo.recompute_advantage {
                 targets = self.recompute(rollout, rules)?;
+                targets.check_finite(self.progress.updates + 1)?;
             }
             order.shuffle(&mut rng);
             for chosen in order.chunks(ppo.batch) {
@@ -273,9 +288,9 @@ impl Learner {
         losses.grad_norm = f64::from(global_norm(&grads));
         match losses.named().iter().find(|(_, v)| !v.is_finite()) {
             Some((name, value)) => Err(Error::run(format!(
-                "{name} became {value} in update {}: the run stops before it reaches the weights. A lower learning rate (adam.lr) or a \
-                 tighter ppo.max_grad_norm may help; the last checkpoint is whole",
-                self.progress.updates
+                "{name} became {value} in update {}, before it reached the weights. A lower learning rate (adam.lr) or a tighter \
+                 ppo.max_grad_norm may help",
+                self.progress.updates + 1
             ))),
             None => Ok((grads, losses, ratio_error)),
         }

@@ -147,7 +147,7 @@ impl Trainer {
             let mut clock = Clock::default();
             let begun = self.stats.updates;
             while self.stats.updates < per_epoch {
-                self.update(&mut clock)?;
+                self.update(&mut clock).map_err(|e| self.stopped(e))?;
                 console.tick();
                 if stop.load(Ordering::SeqCst) && self.stats.updates < per_epoch {
                     self.save()?;
@@ -155,7 +155,7 @@ impl Trainer {
                 }
             }
             let steps = (per_epoch - begun) * self.plan.recipe.run.collect_steps as u64;
-            let row = self.finish_epoch(&mut clock)?;
+            let row = self.finish_epoch(&mut clock).map_err(|e| self.stopped(e))?;
             metrics.iter_mut().try_for_each(|m| m.log(self.epoch, &row))?;
             timing.log(self.epoch, &clock.row(steps))?;
             let rate = steps as f64 / clock.total();
@@ -175,6 +175,16 @@ impl Trainer {
         }
         self.finish()?;
         Ok(Outcome::Finished)
+    }
+
+    /// What stopped the run, and what is left of it.
+    fn stopped(&self, error: Error) -> Error {
+        let root = self.dir.join("checkpoints");
+        let left = match checkpoint::list(&root).pop() {
+            Some(name) => format!("the last good checkpoint is {}", root.join(name).display()),
+            None => "no checkpoint was written before".into(),
+        };
+        Error::run(format!("the run stops in epoch {}: {error}; {left}", self.epoch + 1))
     }
 
     /// One collection and one update.

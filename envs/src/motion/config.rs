@@ -14,7 +14,7 @@ pub struct Weights {
     pub dist: f32,
     pub orient: f32,
     pub attention: f32,
-    /// The pose prior is only asked when this is not 0: it takes about a tenth of a step's time.
+    /// The pose prior is only asked when this is not 0, for that takes time.
     pub pose: f32,
     pub penetration: f32,
     pub success: f32,

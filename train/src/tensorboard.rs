@@ -73,7 +73,7 @@ mod tests {
         // A record: length (8 bytes), its checksum (4), data, its checksum (4).
         while at < bytes.len() {
             let n = u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap()) as usize;
-            events.push(protobuf::parse_from_bytes(&bytes[at + 12..at + 12 + n]).unwrap());
+            events.push(Event::parse_from_bytes(&bytes[at + 12..at + 12 + n]).unwrap());
             at += 16 + n;
         }
         assert_eq!(events.len(), 2);

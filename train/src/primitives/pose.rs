@@ -334,7 +334,7 @@ mod tests {
         let (mut g, mut tape) = (w.zeros(), Tape::default());
         tape.forward(&w, &x, &eps);
         tape.backward(&w, &mut g, &x, &eps, &truth, rows);
-        for k in 0..7 {
+        for (k, name) in NAMES.iter().enumerate() {
             let gradient = g.layers[k].weight.clone();
             let norm = gradient.iter().map(|v| v * v).sum::<f32>().sqrt();
             let random = normals(rng, gradient.len());
@@ -347,7 +347,7 @@ mod tests {
                 };
                 let want = (moved(3e-3) - moved(-3e-3)) / 6e-3;
                 let got: f32 = gradient.iter().zip(&direction).map(|(g, d)| g * d).sum();
-                assert!((f64::from(got) - want).abs() < 0.02 * f64::from(norm) + 1e-4, "{}: {got} {want} of {norm}", NAMES[k]);
+                assert!((f64::from(got) - want).abs() < 0.02 * f64::from(norm) + 1e-4, "{name}: {got} {want} of {norm}");
             }
         }
     }

@@ -204,11 +204,14 @@ fn parse_bone(lines: &mut Lines) -> Result<Bone> {
 }
 
 fn parse_axis(lines: &Lines, line: &[&str]) -> Result<Vec<(usize, f32)>> {
-    let (numbers, order) = line.split_at(line.len() - 1);
+    let [numbers @ .., order] = line else { return Err(lines.error("empty")) };
+    if numbers.is_empty() {
+        return Err(lines.error("'axis' alone, expected three angles and their order"));
+    }
     let angles = lines.vector(numbers)?;
-    let axes: Vec<usize> = order[0].bytes().filter_map(|b| b"XYZ".iter().position(|&a| a == b.to_ascii_uppercase())).collect();
-    if order[0].len() != 3 || (0..3).any(|axis| !axes.contains(&axis)) {
-        return Err(lines.error(format!("axis order '{}', expected the letters X, Y and Z once each", order[0])));
+    let axes: Vec<usize> = order.bytes().filter_map(|b| b"XYZ".iter().position(|&a| a == b.to_ascii_uppercase())).collect();
+    if order.len() != 3 || (0..3).any(|axis| !axes.contains(&axis)) {
+        return Err(lines.error(format!("axis order '{order}', expected the letters X, Y and Z once each")));
     }
     Ok(axes.into_iter().map(|axis| (axis, angles[axis])).collect())
 }

@@ -9,10 +9,18 @@ use super::numpy::{Array, Npz, parse_npy};
 use super::samp::parse_samp;
 use super::zip::{Archive, pack};
 use proptest::prelude::*;
+use proptest::test_runner::RngSeed;
 use std::path::Path;
 
 fn fixture(name: &str) -> Vec<u8> {
     std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)).unwrap()
+}
+
+/// The same 256 cases every time; `EGOGEN_FUZZ=20000` tries that many new ones.
+fn config() -> ProptestConfig {
+    let wanted = std::env::var("EGOGEN_FUZZ").ok().and_then(|n| n.parse().ok());
+    let rng_seed = if wanted.is_some() { RngSeed::Random } else { RngSeed::Fixed(1) };
+    ProptestConfig { cases: wanted.unwrap_or(256), rng_seed, failure_persistence: None, ..ProptestConfig::default() }
 }
 
 /// Up to six changes, each of one byte, a cut or a doubled stretch, at a part (0..1) of the file.
@@ -50,7 +58,7 @@ fn read_npz(bytes: &[u8]) {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 256, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(config())]
 
     #[test]
     fn damaged_texts(changes in damage()) {

@@ -54,11 +54,12 @@ fn mistakes_are_told() {
     let fails = |program: &str, arguments: &[&str], expected: &str| {
         let done = run(program, arguments, dir.path());
         let message = text(&done.stderr);
-        assert!(!done.status.success() && message.contains(expected), "{arguments:?}: {message}");
+        assert!(done.status.code() == Some(2) && message.contains(expected), "{arguments:?}: {message}");
     };
     fails(env!("CARGO_BIN_EXE_evaluate"), &["nowhere", "--no-baselines"], "nowhere");
     fails(env!("CARGO_BIN_EXE_evaluate"), &["--episodes", "0"], "--episodes");
     fails(env!("CARGO_BIN_EXE_evaluate"), &["--model", "nowhere"], "nowhere");
+    fails(env!("CARGO_BIN_EXE_evaluate"), &["--set", "pose.prior=gone.safetensors"], "gone.safetensors");
     fails(env!("CARGO_BIN_EXE_play"), &["nowhere"], "nowhere");
     fails(env!("CARGO_BIN_EXE_curves"), &["nowhere"], "metrics.csv");
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0, "nothing is left behind");

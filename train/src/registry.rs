@@ -105,7 +105,8 @@ fn motion(options: &toml::Table, n: usize, purpose: Purpose) -> Result<Made> {
         Purpose::Train => MotionEnv::new(options.task, sim, world.train, n, 0),
         Purpose::Test => MotionEnv::evaluation(options.task, sim, world.held_out, n, 0),
     };
-    Ok(Made { env: Box::new(env?), origin })
+    let env = env.map_err(|e| Error::config(format!("env_options: {e}")))?;
+    Ok(Made { env: Box::new(env), origin })
 }
 
 #[cfg(test)]

@@ -54,7 +54,7 @@ fn run(args: &Args) -> Result<u8> {
     let episodes = args.episodes.get();
     let world = program::world(args.model.as_deref())?;
     let task = program::task(&args.set)?;
-    let mut env = MotionEnv::evaluation(task, world.sim.clone(), world.held_out.clone(), episodes, args.seed)?;
+    let mut env = MotionEnv::evaluation(task, world.sim.clone(), world.held_out.clone(), episodes, args.seed).given()?;
     let mut actors: Vec<(String, Actor)> = Vec::new();
     if !args.no_baselines {
         actors.push(("latents 0".into(), Actor::Zero));

@@ -56,8 +56,8 @@ fn main() -> ExitCode {
 
 fn run(args: &Args) -> Result<u8> {
     let world = program::world(args.model.as_deref())?;
-    let mut env =
-        MotionEnv::evaluation(program::task(&args.set)?, world.sim.clone(), world.held_out.clone(), args.starts.get(), args.seed)?;
+    let mut env = MotionEnv::evaluation(program::task(&args.set)?, world.sim.clone(), world.held_out.clone(), args.starts.get(), args.seed)
+        .given()?;
     let actor = match args.policy.as_str() {
         "zero" => Actor::Zero,
         "prior" => Actor::Prior,

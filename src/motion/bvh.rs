@@ -1,4 +1,4 @@
-//! CMU motion in Biovision hierarchy (BVH) files.
+//! Biovision hierarchy (BVH) files, and CMU motion in them.
 
 use super::cmu::{CMU_JOINTS, CMU_PARENTS, SourceClip, SourceFrame, alignments, cmu_joint, leg_length};
 use super::resample::check_fps;
@@ -14,11 +14,30 @@ enum Channel {
     Rotation(usize),
 }
 
-struct Joint {
-    parent: usize,
-    offset: Vec3,
+/// A joint of a hierarchy; the root is its own parent.
+pub(super) struct Joint {
+    pub name: String,
+    pub parent: usize,
+    /// From the parent in the rest pose, file units.
+    pub offset: Vec3,
     channels: Vec<Channel>,
 }
+
+/// A file as written.
+pub(super) struct Bvh {
+    pub joints: Vec<Joint>,
+    pub fps: f32,
+    pub frames: Vec<BvhFrame>,
+}
+
+/// One frame: the root's position, file units, and each joint's rotation against the world, the identity in the rest pose.
+pub(super) struct BvhFrame {
+    pub root: Vec3,
+    pub rots: Vec<Quat>,
+}
+
+/// Joints that a file may have, ends included.
+const MAX_JOINTS: usize = 256;
 
 /// Words of a file with the line and the place in the line each came from.
 struct Words<'a> {
@@ -83,46 +102,60 @@ pub fn read_bvh(path: impl AsRef<Path>, name: &str) -> Result<SourceClip> {
 
 /// [`read_bvh`] of the text of a file; `path` names it in errors.
 pub(super) fn parse_bvh(path: &Path, text: &str, name: &str) -> Result<SourceClip> {
-    let mut words = Words::new(path, text);
-    words.word("HIERARCHY")?;
-    words.word("ROOT")?;
-    let mut joints = Vec::new();
-    parse_joint(&mut words, 0, false, &mut joints)?;
-    check_topology(path, &joints)?;
-    words.word("MOTION")?;
-    words.word("Frames:")?;
-    let count = words.count()?;
-    words.word("Frame")?;
-    words.word("Time:")?;
-    let step = words.number()?;
-    if count == 0 || step <= 0.0 {
-        return Err(Error::file(path, format!("has {count} frames of {step} s, expected more than none of each")));
+    Bvh::parse(path, text)?.cmu(path, name)
+}
+
+impl Bvh {
+    /// Reads the text of a file; `path` names it in errors.
+    pub fn parse(path: &Path, text: &str) -> Result<Self> {
+        let mut words = Words::new(path, text);
+        words.word("HIERARCHY")?;
+        words.word("ROOT")?;
+        let mut joints = Vec::new();
+        parse_joint(&mut words, 0, false, &mut joints)?;
+        words.word("MOTION")?;
+        words.word("Frames:")?;
+        let count = words.count()?;
+        words.word("Frame")?;
+        words.word("Time:")?;
+        let step = words.number()?;
+        if count == 0 || step <= 0.0 {
+            return Err(Error::file(path, format!("has {count} frames of {step} s, expected more than none of each")));
+        }
+        // Written frame times have few digits.
+        let fps = check_fps(path, "Frame Time", (1.0 / step).round())?;
+        let frames = (0..count).map(|_| parse_frame(&mut words, &joints)).collect::<Result<_>>()?;
+        if words.next < words.words.len() {
+            return Err(words.error(&format!("the end of the file after {count} frames")));
+        }
+        Ok(Self { joints, fps, frames })
     }
-    // Written frame times have few digits.
-    let fps = check_fps(path, "Frame Time", (1.0 / step).round())?;
-    let leg = joints[cmu_joint::L_KNEE].offset.length() + joints[cmu_joint::L_ANKLE].offset.length();
-    // Metres per file unit, so that the legs get the common skeleton's length.
-    let scale = leg_length() / leg;
-    let align = alignments(|_, child| joints[child].offset);
-    if leg <= 0.0 {
-        return Err(Error::file(path, "the left leg has no length: its OFFSETs are 0"));
+
+    /// Puts the motion on the common CMU skeleton; see [`read_bvh`].
+    pub fn cmu(&self, path: &Path, name: &str) -> Result<SourceClip> {
+        check_topology(path, &self.joints)?;
+        let leg = self.joints[cmu_joint::L_KNEE].offset.length() + self.joints[cmu_joint::L_ANKLE].offset.length();
+        if leg <= 0.0 {
+            return Err(Error::file(path, "the left leg has no length: its OFFSETs are 0"));
+        }
+        // Metres per file unit, so that the legs get the common skeleton's length.
+        let scale = leg_length() / leg;
+        let align = alignments(|_, child| self.joints[child].offset);
+        let frame = |f: &BvhFrame| SourceFrame { root: f.root * scale, rots: std::array::from_fn(|j| (f.rots[j] * align[j]).normalize()) };
+        Ok(SourceClip { name: name.to_string(), fps: self.fps, frames: self.frames.iter().map(frame).collect() })
     }
-    let frames = (0..count).map(|_| parse_frame(&mut words, &joints, scale, &align)).collect::<Result<_>>()?;
-    if words.next < words.words.len() {
-        return Err(words.error(&format!("the end of the file after {count} frames")));
-    }
-    Ok(SourceClip { name: name.to_string(), fps, frames })
 }
 
 fn parse_joint(words: &mut Words, parent: usize, is_end: bool, joints: &mut Vec<Joint>) -> Result<()> {
     let index = joints.len();
-    if index == CMU_JOINTS {
-        return Err(words.error(&format!("no more than the {CMU_JOINTS} joints of the CMU skeleton, ends included")));
+    if index == MAX_JOINTS {
+        return Err(words.error(&format!("no more than {MAX_JOINTS} joints, ends included")));
     }
-    words.next += 1; // The name, which differs between files.
+    let name = words.peek().to_string();
+    words.next += 1;
     words.word("{")?;
     words.word("OFFSET")?;
-    joints.push(Joint { parent, offset: words.vector()?, channels: Vec::new() });
+    joints.push(Joint { name, parent, offset: words.vector()?, channels: Vec::new() });
     if !is_end {
         words.word("CHANNELS")?;
         let count = words.count()?;
@@ -172,21 +205,20 @@ fn check_topology(path: &Path, joints: &[Joint]) -> Result<()> {
     }
 }
 
-fn parse_frame(words: &mut Words, joints: &[Joint], scale: f32, align: &[Quat; CMU_JOINTS]) -> Result<SourceFrame> {
-    let mut frame = SourceFrame { root: Vec3::ZERO, rots: [Quat::IDENTITY; CMU_JOINTS] };
+fn parse_frame(words: &mut Words, joints: &[Joint]) -> Result<BvhFrame> {
+    let mut frame = BvhFrame { root: Vec3::ZERO, rots: Vec::with_capacity(joints.len()) };
     for (j, joint) in joints.iter().enumerate() {
         let mut local = Quat::IDENTITY;
         for &channel in &joint.channels {
             let value = words.number()?;
             match channel {
-                Channel::Position(axis) if j == 0 => frame.root[axis] = value * scale,
+                Channel::Position(axis) if j == 0 => frame.root[axis] = value,
                 Channel::Position(_) => {}
                 Channel::Rotation(axis) => local *= Quat::from_axis_angle(Vec3::AXES[axis], value.to_radians()),
             }
         }
-        frame.rots[j] = if j == 0 { local } else { (frame.rots[joint.parent] * local).normalize() };
+        frame.rots.push(if j == 0 { local } else { (frame.rots[joint.parent] * local).normalize() });
     }
-    frame.rots.iter_mut().zip(align).for_each(|(rot, align)| *rot = (*rot * *align).normalize());
     Ok(frame)
 }
 

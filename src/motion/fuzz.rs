@@ -2,9 +2,10 @@
 
 use super::amass::parse_amass;
 use super::asf::{parse_amc, parse_asf};
-use super::bvh::parse_bvh;
+use super::bvh::{Bvh, parse_bvh};
 use super::canonical::CanonicalPrimitive;
 use super::cmu::parse_expmap;
+use super::named::parse_named;
 use super::numpy::{Array, Npz, parse_npy};
 use super::samp::parse_samp;
 use super::zip::{Archive, pack};
@@ -64,6 +65,9 @@ proptest! {
     fn damaged_texts(changes in damage()) {
         let path = Path::new("damaged");
         let _ = parse_bvh(path, &text("motion/small.bvh", &changes), "damaged");
+        if let Ok(bvh) = Bvh::parse(path, &text("motion/named.bvh", &changes)) {
+            let _ = parse_named(path, &bvh, "damaged");
+        }
         let _ = parse_expmap(path, &text("motion/expmap.txt", &changes), "damaged");
         let good = parse_asf(path, &text("importers/small.asf", &[])).unwrap();
         let _ = parse_amc(path, &text("importers/small.amc", &changes), &good, "damaged", None);

@@ -2,10 +2,11 @@
 
 use super::amass::parse_amass;
 use super::asf::{read_amc, read_asf};
-use super::bvh::read_bvh;
+use super::bvh::Bvh;
 use super::canonical::CanonicalPrimitive;
 use super::clip::{Clip, Skeleton};
-use super::cmu::{SourceClip, read_expmap};
+use super::cmu::{CMU_JOINTS, SourceClip, read_expmap};
+use super::named::parse_named;
 use super::numpy::Npz;
 use super::poses::{PoseClip, Up};
 use super::retarget::{RetargetReport, retarget};
@@ -28,7 +29,7 @@ pub struct ImportOptions {
 pub enum Recorded {
     /// Joints of the CMU skeleton: exponential maps, BVH, Acclaim.
     Cmu(SourceClip),
-    /// Rotations of SMPL-X's joints: AMASS, SAMP, EgoGen's canonical primitives.
+    /// Rotations of SMPL-X's joints: AMASS, SAMP, EgoGen's canonical primitives, BVH whose joints are known by name.
     Smplx(PoseClip),
 }
 
@@ -52,13 +53,19 @@ pub fn import(path: impl AsRef<Path>, options: &ImportOptions) -> Result<Recorde
     let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
     Ok(match extension.as_str() {
         "txt" => Recorded::Cmu(read_expmap(path, &name)?),
-        "bvh" => Recorded::Cmu(read_bvh(path, &name)?),
+        "bvh" => read_bvh(path, &name)?,
         "amc" => Recorded::Cmu(read_amc(path, &read_asf(skeleton_of(path, &name)?)?, &name, options.fps)?),
         "asf" => return Err(Error::file(path, "is a skeleton without motion, expected its .amc")),
         "npz" => Recorded::Smplx(read_npz(path, &name, options.up)?),
         "pkl" | "pickle" => Recorded::Smplx(read_samp(path, &name, options.up)?),
         _ => return Err(Error::file(path, "is of no known kind, expected .txt, .bvh, .amc, .npz or .pkl")),
     })
+}
+
+/// A file with the joints of the CMU skeleton is one of CMU, any other one needs joints whose names are known.
+fn read_bvh(path: &Path, name: &str) -> Result<Recorded> {
+    let bvh = Bvh::parse(path, &fs::read_to_string(path).map_err(|e| Error::io(path, e))?)?;
+    Ok(if bvh.joints.len() == CMU_JOINTS { Recorded::Cmu(bvh.cmu(path, name)?) } else { Recorded::Smplx(parse_named(path, &bvh, name)?) })
 }
 
 fn read_npz(path: &Path, name: &str, up: Option<Up>) -> Result<PoseClip> {

@@ -16,6 +16,7 @@ pub mod ik;
 mod import;
 mod layers;
 mod mend;
+mod named;
 mod net;
 mod numpy;
 mod pickle;

@@ -5,6 +5,7 @@ use super::augment::{Kind, RECIPE, augment, hip_twists, mirror};
 use super::clip::{Clip, Skeleton, quantile, wrap};
 use super::cmu::{SourceClip, read_expmap};
 use super::footlock::slides;
+use super::import::{ImportOptions, import};
 use super::primitive::MotionSet;
 use super::retarget::{RetargetReport, retarget};
 use super::{FUTURE, bvh::read_bvh};
@@ -19,6 +20,8 @@ use std::path::{Path, PathBuf};
 const WALKS: [&str; 4] = ["test/walking", "test/walking_extra", "train/walking", "train/walking_extra"];
 /// BVH files that are used. 131 is a dance with stretched arms, 02_01 stands too high, 01_01 and 05_01 are no locomotion.
 const BVHS: [&str; 1] = ["16_11"];
+/// Folder, beside `mocap/cmu_expmap`, of recordings of people who stand; they lend stops their upper bodies.
+const IDLE: &str = "reactidle_mit";
 /// Clips kept from training: seven straight walks and a turning one.
 const HELD_OUT: [&str; 8] = [
     "test/walking_extra/walking_10",
@@ -72,7 +75,7 @@ pub struct Clips {
     pub held_out: Vec<Clip>,
 }
 
-/// Reads the unpacked `mocap-cmu` archive in `data_dir`, retargets it to `model`, augments it and makes its markers.
+/// Reads the unpacked `mocap-cmu` and `mocap-idle` archives in `data_dir`, retargets them to `model`, augments them and makes markers.
 ///
 /// Returns the training set, the held-out set (never augmented) and what was measured. `seed` fixes the augmentation.
 pub fn build(data_dir: impl AsRef<Path>, seed: u64, model: &BodyModel) -> Result<(MotionSet, MotionSet, BuildReport)> {
@@ -89,7 +92,7 @@ pub fn build_clips(data_dir: impl AsRef<Path>, seed: u64, skeleton: &Skeleton) -
     let (clips, reports): (Vec<Clip>, Vec<RetargetReport>) = mapped.into_iter().unzip();
     let mut report = retarget_report(&reports);
     let (held_out, originals): (Vec<_>, Vec<_>) = clips.into_iter().partition(|c| HELD_OUT.contains(&c.name.as_str()));
-    let (variations, made) = augment(skeleton, &originals, seed);
+    let (variations, made) = augment(skeleton, &originals, &read_idle(data_dir.as_ref(), skeleton)?, seed);
     (report.made, report.kept) = (made, variations.len());
     report.sets.push(("held out".into(), SetStats::new(skeleton, &held_out.iter().collect::<Vec<_>>())));
     report.sets.push(("original".into(), SetStats::new(skeleton, &originals.iter().collect::<Vec<_>>())));
@@ -104,8 +107,23 @@ pub fn build_clips(data_dir: impl AsRef<Path>, seed: u64, skeleton: &Skeleton) -
     Ok((Clips { train, held_out }, report))
 }
 
+/// The folder that the archives unpack to.
+fn root(data_dir: &Path) -> PathBuf {
+    if data_dir.join("mocap").is_dir() { data_dir.join("mocap") } else { data_dir.to_path_buf() }
+}
+
+/// Recordings of people who stand, on the body.
+fn read_idle(data_dir: &Path, skeleton: &Skeleton) -> Result<Vec<Clip>> {
+    let dir = root(data_dir).join(IDLE);
+    if !dir.is_dir() {
+        return Err(Error::file(data_dir, format!("holds no folder mocap/{IDLE}: expected the unpacked mocap-idle archive")));
+    }
+    let files = sorted_files(&dir, "bvh")?;
+    files.par_iter().map(|(path, _)| Ok(import(path, &ImportOptions::default())?.put_on(skeleton)?.0)).collect()
+}
+
 fn read_sources(data_dir: &Path) -> Result<Vec<SourceClip>> {
-    let root = if data_dir.join("mocap").is_dir() { data_dir.join("mocap") } else { data_dir.to_path_buf() };
+    let root = root(data_dir);
     if !root.join("cmu_expmap").is_dir() {
         return Err(Error::file(data_dir, "holds no folder mocap/cmu_expmap: expected the unpacked mocap-cmu archive"));
     }

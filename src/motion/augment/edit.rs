@@ -13,6 +13,8 @@ const UPPER: [usize; 13] = [3, 6, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21];
 const CALM: f32 = 0.85;
 /// Steps shorter than this (metres) go by time, longer ones by way.
 const MIN_WAY: f32 = 0.2;
+/// Frames of half a walking cycle.
+const HALF_CYCLE: usize = 22;
 /// Part of its length to which a standing leg is stretched.
 const STANDING: f32 = 0.99;
 
@@ -43,17 +45,18 @@ impl Planar {
     }
 }
 
-/// The transforms that turn the clip's root path by the angle `yaw[t]` (radians) and shorten each step of it to `stride[t]`.
+/// The transforms that turn the clip's root path by the angle `yaw[t]` (radians) and make of each metre of it `stride[t]`: x metres
+/// along the path and y metres to its left.
 ///
-/// p'(t) = p'(t-1) + stride R(yaw) (p(t) - p(t-1)) with both factors at the step's middle.
-pub fn bent_path(clip: &Clip, yaw: &[f32], stride: &[f32]) -> Vec<Planar> {
+/// p'(t) = p'(t-1) + R(yaw) S (p(t) - p(t-1)), S = [x -y; y x], with both factors at the step's middle.
+pub fn bent_path(clip: &Clip, yaw: &[f32], stride: &[Vec2]) -> Vec<Planar> {
     let at = |t: usize| clip.poses[t].root.truncate();
     let mut place = at(0);
     (0..clip.len())
         .map(|t| {
             if t > 0 {
                 let (angle, scale) = (0.5 * (yaw[t] + yaw[t - 1]), 0.5 * (stride[t] + stride[t - 1]));
-                place += scale * turn(angle, at(t) - at(t - 1));
+                place += scale.rotate(turn(angle, at(t) - at(t - 1)));
             }
             Planar { yaw: yaw[t], shift: place - turn(yaw[t], at(t)) }
         })
@@ -63,16 +66,39 @@ pub fn bent_path(clip: &Clip, yaw: &[f32], stride: &[f32]) -> Vec<Planar> {
 /// Moves the body along `path` (one transform per frame) while every stance of a foot moves as one rigid piece.
 ///
 /// A stance takes the transform of its middle frame, so the foot keeps its own roll and does not slide; in a swing the
-/// foot goes over from one stance's transform to the next as it proceeds along its step. The legs follow by IK.
-pub fn replant(skeleton: &Skeleton, clip: &Clip, path: &[Planar]) -> Clip {
+/// foot goes over from one stance's transform to the next as it proceeds along its step. Each foot is planted `spread` (metres,
+/// per frame) further out than it was. The legs follow by IK.
+pub fn replant(skeleton: &Skeleton, clip: &Clip, path: &[Planar], spread: &[f32]) -> Clip {
     let mut out = clip.clone();
     for (pose, m) in out.poses.iter_mut().zip(path) {
         pose.root = m.point(pose.root);
         pose.rots.iter_mut().for_each(|q| *q = m.rot(*q));
     }
-    let feet = std::array::from_fn(|side| replanted_track(&clip.feet(skeleton, side), &clip.stances(side), path));
+    let feet = std::array::from_fn(|side| {
+        let outward = if side == 0 { 1.0 } else { -1.0 };
+        let left = |pose: &Pose| turn(heading(pose.rots[0]), Vec2::X);
+        let moved = path.iter().zip(&out.poses).zip(spread);
+        let places: Vec<Planar> = moved.map(|((m, pose), s)| Planar { shift: m.shift + outward * s * left(pose), ..*m }).collect();
+        replanted_track(&clip.feet(skeleton, side), &clip.stances(side), &places)
+    });
     set_feet(skeleton, &mut out, &feet);
     out
+}
+
+/// How far out feet must be planted, metres, so that they do not cross where `stride` (see [`bent_path`]) leads sideways.
+///
+/// In side steps the leading foot steps wide and the other one closes. With the pelvis moving on evenly, a quarter of the way of
+/// a whole cycle either way keeps the feet's distance in closing what it was.
+pub fn sideways_spread(clip: &Clip, stride: &[Vec2]) -> Vec<f32> {
+    let n = clip.len();
+    let step = |t: usize| stride[t].y * (clip.poses[t].root - clip.poses[t - 1].root).truncate().length();
+    (0..n)
+        .map(|t| {
+            let cycle = t.saturating_sub(HALF_CYCLE) + 1..(t + HALF_CYCLE).min(n - 1) + 1;
+            let share = (2 * HALF_CYCLE) as f32 / cycle.len() as f32;
+            0.25 * share * cycle.map(step).sum::<f32>().abs()
+        })
+        .collect()
 }
 
 fn replanted_track(feet: &[FootPose], stances: &[std::ops::Range<usize>], path: &[Planar]) -> Vec<FootPose> {
@@ -202,6 +228,32 @@ pub fn calm(skeleton: &Skeleton, clip: &Clip, amount: &[f32]) -> Clip {
     }
     // Levelled about their ankles, the feet have left the floor and slipped: put them down again.
     lock_feet(skeleton, &mut out);
+    out
+}
+
+/// Gives `clip` by `weight[t]` (0 none, 1 all) the upper body of somebody who stands, `idle` from frame `from` on, and carries
+/// the pelvis over the feet as that person does; the feet stay where they are.
+pub fn stand_idly(skeleton: &Skeleton, clip: &Clip, idle: &Clip, from: usize, weight: &[f32]) -> Clip {
+    let mut out = clip.clone();
+    let between = |p: &Pose| 0.5 * (skeleton.foot(p, 0).ankle + skeleton.foot(p, 1).ankle);
+    let facing = |c: &Clip, t: usize| heading(c.poses[t].rots[0]);
+    let middle = from + clip.len() / 2;
+    for (t, pose) in out.poses.iter_mut().enumerate() {
+        let (w, like) = (weight[t], &idle.poses[from + t]);
+        if w == 0.0 {
+            continue;
+        }
+        let yaw = Planar { yaw: facing(clip, t) - facing(idle, middle), shift: Vec2::ZERO };
+        let old = clip.poses[t];
+        pose.root = old.root.lerp(between(&old) + yaw.point(like.root - between(like)), w);
+        pose.rots[0] = old.rots[0].slerp(yaw.rot(like.rots[0]), w);
+        for j in UPPER {
+            let local = |p: &Pose| p.rots[PARENTS[j]].inverse() * p.rots[j];
+            pose.rots[j] = (pose.rots[PARENTS[j]] * local(&old).slerp(local(like), w)).normalize();
+        }
+    }
+    let feet = std::array::from_fn(|side| clip.feet(skeleton, side));
+    set_feet(skeleton, &mut out, &feet);
     out
 }
 

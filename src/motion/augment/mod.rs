@@ -1,15 +1,16 @@
-//! Augmentation: turning, slowing, stopping, small and backward steps, made from straight walks.
+//! Augmentation: turning, slowing, stopping, standing, small, side and backward steps, made from straight walks.
 
 mod edit;
 #[cfg(test)]
 mod tests;
 
-pub use edit::{Planar, bent_path, calm, mirror, raise, replant, resample};
+pub use edit::{Planar, bent_path, calm, mirror, raise, replant, resample, sideways_spread, stand_idly};
 
 use super::FPS;
 use super::clip::{Clip, SIDES, Skeleton, heading, quantile, smoothstep, wrap};
 use super::footlock::slides;
 use crate::rng::{Stream, stream};
+use glam::Vec2;
 use rand::RngExt;
 
 /// Fastest yaw rate that bending adds, radians per second (110 degrees, as real turns have it).
@@ -19,6 +20,8 @@ const MAX_RATE: f32 = 1.92;
 const MAX_SLIDE: f32 = 0.015;
 const MAX_TWIST: f32 = 1.05;
 const MAX_ACCELERATION: f32 = 130.0;
+/// How much further out each foot stands than in a walk when a person stands, metres.
+const STANDING_SPREAD: f32 = 0.05;
 /// Frames an augmented clip must have.
 const MIN_FRAMES: usize = 40;
 
@@ -29,19 +32,25 @@ pub enum Kind {
     Bent,
     /// 0.55 to 0.85 of the speed, on another path.
     SlowBent,
-    /// Stops at a double support, stands, walks on.
+    /// Stops at a double support, stands idly, walks on.
     Stop,
     /// Small steps or steps on the spot, with strong turns.
     Small,
+    /// Turns on the spot.
+    Spot,
+    /// Side steps, straight or askew, the body facing ahead.
+    Side,
     /// Walks backward: time runs back at 0.6 of the speed.
     Reversed,
 }
 
 /// Variations made of every clip (each also mirrored).
-pub const RECIPE: [(Kind, usize); 5] = [(Kind::Bent, 2), (Kind::SlowBent, 2), (Kind::Stop, 1), (Kind::Small, 1), (Kind::Reversed, 1)];
+pub const RECIPE: [(Kind, usize); 7] =
+    [(Kind::Bent, 2), (Kind::SlowBent, 2), (Kind::Stop, 2), (Kind::Small, 1), (Kind::Spot, 1), (Kind::Side, 2), (Kind::Reversed, 1)];
 
-/// Variations of `clips` within the limits of slide and hip twist, and how many were made; `seed` fixes all draws.
-pub fn augment(skeleton: &Skeleton, clips: &[Clip], seed: u64) -> (Vec<(Kind, Clip)>, usize) {
+/// Variations of `clips` within the limits of slide and hip twist, and how many were made; `seed` fixes all draws. `idle`: people
+/// who stand; without any, stops are mere stops.
+pub fn augment(skeleton: &Skeleton, clips: &[Clip], idle: &[Clip], seed: u64) -> (Vec<(Kind, Clip)>, usize) {
     use rayon::prelude::*;
     let mut jobs = Vec::new();
     for clip in clips {
@@ -53,7 +62,7 @@ pub fn augment(skeleton: &Skeleton, clips: &[Clip], seed: u64) -> (Vec<(Kind, Cl
         .par_iter()
         .enumerate()
         .map(|(i, &(clip, kind, copy))| {
-            let mut out = vary(skeleton, clip, kind, &mut stream(seed, "augment", i as u64))?;
+            let mut out = vary(skeleton, clip, idle, kind, &mut stream(seed, "augment", i as u64))?;
             out.name = format!("{}~{kind:?}{copy}", clip.name).to_lowercase();
             keep(skeleton, &out).then_some((kind, out))
         })
@@ -62,7 +71,7 @@ pub fn augment(skeleton: &Skeleton, clips: &[Clip], seed: u64) -> (Vec<(Kind, Cl
 }
 
 /// One variation; none when the clip does not offer what it needs.
-fn vary(skeleton: &Skeleton, clip: &Clip, kind: Kind, rng: &mut Stream) -> Option<Clip> {
+fn vary(skeleton: &Skeleton, clip: &Clip, idle: &[Clip], kind: Kind, rng: &mut Stream) -> Option<Clip> {
     Some(match kind {
         Kind::Bent => bend(skeleton, clip, 1.0, rng),
         Kind::SlowBent => {
@@ -71,8 +80,23 @@ fn vary(skeleton: &Skeleton, clip: &Clip, kind: Kind, rng: &mut Stream) -> Optio
             let bent = bend(skeleton, clip, 1.0, rng);
             resample(skeleton, &bent, &uniform_times(clip.len(), speed))
         }
-        Kind::Stop => stop(skeleton, clip, rng)?,
-        Kind::Small => small_steps(skeleton, clip, rng),
+        Kind::Stop => stop(skeleton, clip, idle, rng)?,
+        Kind::Small => {
+            let mut draw = || Vec2::X * rng.random_range(-0.35..0.75f32);
+            let ends = [draw(), draw()];
+            short_steps(skeleton, clip, ends, 1.1, rng)
+        }
+        Kind::Spot => {
+            let mut draw = || Vec2::X * rng.random_range(-0.1..0.15f32);
+            let ends = [draw(), draw()];
+            short_steps(skeleton, clip, ends, 1.3, rng)
+        }
+        Kind::Side => {
+            let side = if rng.random() { 1.0 } else { -1.0 };
+            let mut draw = || Vec2::new(rng.random_range(-0.2..0.5), side * rng.random_range(0.1..0.4f32));
+            let ends = [draw(), draw()];
+            short_steps(skeleton, clip, ends, 0.4, rng)
+        }
         Kind::Reversed => {
             let bent = bend(skeleton, clip, 0.6, rng);
             let mut times = uniform_times(clip.len(), 0.6);
@@ -88,7 +112,7 @@ fn uniform_times(len: usize, speed: f32) -> Vec<f32> {
 
 fn bend(skeleton: &Skeleton, clip: &Clip, strength: f32, rng: &mut Stream) -> Clip {
     let yaw = random_yaw(clip.len(), strength, rng);
-    replant(skeleton, clip, &bent_path(clip, &yaw, &vec![1.0; clip.len()]))
+    replant(skeleton, clip, &bent_path(clip, &yaw, &vec![Vec2::X; clip.len()]), &vec![0.0; clip.len()])
 }
 
 /// Yaw angle per frame: the integral of a rate that moves smoothly between random values, one each 0.8 to 1.6 s.
@@ -116,8 +140,8 @@ fn random_yaw(len: usize, strength: f32, rng: &mut Stream) -> Vec<f32> {
         .collect()
 }
 
-/// Eases to a stand at a double support (the steps before it shrink, limbs calm down), holds, and walks on.
-fn stop(skeleton: &Skeleton, clip: &Clip, rng: &mut Stream) -> Option<Clip> {
+/// Eases to a stand at a double support (the steps before it shrink, limbs calm down), stands like one of `idle`, and walks on.
+fn stop(skeleton: &Skeleton, clip: &Clip, idle: &[Clip], rng: &mut Stream) -> Option<Clip> {
     let n = clip.len();
     let margin = (0.3 * FPS) as usize;
     let places: Vec<usize> = (margin..n.saturating_sub(margin)).filter(|&t| clip.contact[t] == [true; SIDES]).collect();
@@ -126,13 +150,22 @@ fn stop(skeleton: &Skeleton, clip: &Clip, rng: &mut Stream) -> Option<Clip> {
     // Least stride around the stop, so that both feet are planted beside each other, then back to whole steps.
     let (flat, ramp) = (0.3 * FPS, rng.random_range(0.4..0.8) * FPS);
     let fade: Vec<f32> = (0..n).map(|t| 1.0 - smoothstep(((t as f32 - at).abs() - flat) / ramp)).collect();
-    let stride: Vec<f32> = fade.iter().map(|f| 1.0 - (1.0 - least) * f).collect();
+    let stride: Vec<Vec2> = fade.iter().map(|f| Vec2::X * (1.0 - (1.0 - least) * f)).collect();
     let quiet: Vec<f32> = fade.iter().map(|f| (1.0 - least) * f).collect();
     let calmed = calm(skeleton, clip, &quiet);
     let yaw = random_yaw(n, 0.7, rng);
-    let bent = raise(skeleton, &replant(skeleton, &calmed, &bent_path(&calmed, &yaw, &stride)), &quiet);
-    let hold = rng.random_range(0.3..1.5f32);
-    Some(resample(skeleton, &bent, &stop_times(n, at, rng.random_range(0.3..0.6f32), hold)))
+    let bent = raise(skeleton, &replant(skeleton, &calmed, &bent_path(&calmed, &yaw, &stride), &wider(&quiet)), &quiet);
+    let (ease, hold) = (rng.random_range(0.3..0.6f32), rng.random_range(0.3..2.5f32));
+    let stopped = resample(skeleton, &bent, &stop_times(n, at, ease, hold));
+    let fits: Vec<&Clip> = idle.iter().filter(|i| i.len() > stopped.len()).collect();
+    let Some(&stander) = fits.get(rng.random_range(0..fits.len().max(1))) else { return Some(stopped) };
+    let from = rng.random_range(0..stander.len() - stopped.len());
+    // From the middle of the one ease to that of the other.
+    let (begin, end) = (at, at + (ease + hold) * FPS);
+    let ramp = (0.5 * (ease + hold) * FPS).min(0.6 * FPS);
+    let near = |t: usize| smoothstep((t as f32 - begin) / ramp) * smoothstep((end - t as f32) / ramp);
+    let weight: Vec<f32> = (0..stopped.len()).map(near).collect();
+    Some(stand_idly(skeleton, &stopped, stander, from, &weight))
 }
 
 /// Frame times that slow from 1 to 0 towards `at` (frames), stand for `hold` seconds and speed up again.
@@ -160,16 +193,22 @@ fn stop_times(len: usize, at: f32, ease: f32, hold: f32) -> Vec<f32> {
     (0..).map(|t| time(t as f32)).take_while(|&t| t <= (len - 1) as f32).collect()
 }
 
-/// Steps shortened to -0.35 to 0.75 of the clip's, calmer, a little slower, turning strongly when short.
-fn small_steps(skeleton: &Skeleton, clip: &Clip, rng: &mut Stream) -> Clip {
+/// Steps changed smoothly from the first to the second of `ends` (see [`bent_path`]), calmer, a little slower, turning with
+/// `strength`.
+fn short_steps(skeleton: &Skeleton, clip: &Clip, ends: [Vec2; 2], strength: f32, rng: &mut Stream) -> Clip {
     let n = clip.len();
-    let (from, to) = (rng.random_range(-0.35..0.75f32), rng.random_range(-0.35..0.75f32));
-    let stride: Vec<f32> = (0..n).map(|t| from + (to - from) * smoothstep(t as f32 / n as f32)).collect();
-    let quiet: Vec<f32> = stride.iter().map(|s| 0.8 * (1.0 - s.abs())).collect();
+    let stride: Vec<Vec2> = (0..n).map(|t| ends[0].lerp(ends[1], smoothstep(t as f32 / n as f32))).collect();
+    let quiet: Vec<f32> = stride.iter().map(|s| 0.8 * (1.0 - s.length()).max(0.0)).collect();
     let calmed = calm(skeleton, clip, &quiet);
-    let yaw = random_yaw(n, 1.1, rng);
-    let bent = raise(skeleton, &replant(skeleton, &calmed, &bent_path(&calmed, &yaw, &stride)), &quiet);
+    let yaw = random_yaw(n, strength, rng);
+    let spread: Vec<f32> = wider(&quiet).into_iter().zip(sideways_spread(clip, &stride)).map(|(a, b)| a + b).collect();
+    let bent = raise(skeleton, &replant(skeleton, &calmed, &bent_path(&calmed, &yaw, &stride), &spread), &quiet);
     resample(skeleton, &bent, &uniform_times(n, rng.random_range(0.7..1.0)))
+}
+
+/// The spread of feet that goes with a calm body.
+fn wider(quiet: &[f32]) -> Vec<f32> {
+    quiet.iter().map(|q| STANDING_SPREAD * q).collect()
 }
 
 /// Foot yaw against the pelvis in stance, radians, outward or inward alike.

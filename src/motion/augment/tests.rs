@@ -86,8 +86,8 @@ fn edits_that_ask_for_nothing_change_nothing() {
     let skeleton = skeleton();
     let clip = walker(&skeleton, 0.0);
     let n = clip.len();
-    let path = bent_path(&clip, &vec![0.0; n], &vec![1.0; n]);
-    assert!(worst(&skeleton, &replant(&skeleton, &clip, &path), &clip) < 1e-4);
+    let path = bent_path(&clip, &vec![0.0; n], &vec![Vec2::X; n]);
+    assert!(worst(&skeleton, &replant(&skeleton, &clip, &path, &vec![0.0; n]), &clip) < 1e-4);
     let times: Vec<f32> = (0..n).map(|t| t as f32).collect();
     assert!(worst(&skeleton, &resample(&skeleton, &clip, &times), &clip) < 1e-4);
 }
@@ -97,7 +97,7 @@ fn one_rigid_motion_moves_everything_rigidly() {
     let skeleton = skeleton();
     let clip = walker(&skeleton, 0.0);
     let m = Planar { yaw: 0.7, shift: Vec2::new(2.0, -1.0) };
-    let moved = replant(&skeleton, &clip, &vec![m; clip.len()]);
+    let moved = replant(&skeleton, &clip, &vec![m; clip.len()], &vec![0.0; clip.len()]);
     for (a, b) in clip.poses.iter().zip(&moved.poses) {
         for (p, q) in skeleton.joints(a).iter().zip(skeleton.joints(b)) {
             assert!((turn(0.7, p.truncate()) + m.shift - q.truncate()).length() < 1e-4 && (p.z - q.z).abs() < 1e-4);
@@ -110,7 +110,7 @@ fn bent_slow_and_stopped_walks_do_not_slide() {
     let skeleton = skeleton();
     let clip = walker(&skeleton, 0.0);
     for kind in [Kind::Bent, Kind::SlowBent, Kind::Stop, Kind::Small, Kind::Reversed] {
-        let made = vary(&skeleton, &clip, kind, &mut stream(3, "test", kind as u64)).unwrap();
+        let made = vary(&skeleton, &clip, &[], kind, &mut stream(3, "test", kind as u64)).unwrap();
         let slide = quantile(&slides(&skeleton, &made), 0.9);
         assert!(slide < 5e-3, "{kind:?}: {slide}");
     }
@@ -122,8 +122,8 @@ fn bent_path_by_hand() {
     let skeleton = skeleton();
     let clip = walker(&skeleton, 0.0);
     let n = clip.len();
-    let path = bent_path(&clip, &vec![std::f32::consts::FRAC_PI_2; n], &vec![0.5; n]);
-    let out = replant(&skeleton, &clip, &path);
+    let path = bent_path(&clip, &vec![std::f32::consts::FRAC_PI_2; n], &vec![0.5 * Vec2::X; n]);
+    let out = replant(&skeleton, &clip, &path, &vec![0.0; n]);
     assert!((out.poses[40].root.truncate() - Vec2::new(0.5, 0.0)).length() < 1e-4, "{}", out.poses[40].root);
     assert!(out.poses[0].rots[0].angle_between(Quat::from_rotation_z(std::f32::consts::FRAC_PI_2) * clip.poses[0].rots[0]) < 1e-3);
 }
@@ -136,4 +136,48 @@ fn a_stop_holds_and_resumes_by_hand() {
     assert!((times[30] - 30.0).abs() < 1e-4 && (times[50] - 40.0).abs() < 1e-4 && (times[90] - 40.0).abs() < 1e-4);
     assert!((times[110] - 50.0).abs() < 1e-4);
     assert!(times.windows(2).all(|w| (0.0..1.01).contains(&(w[1] - w[0] + 1e-5))));
+}
+
+#[test]
+fn side_steps_by_hand() {
+    let skeleton = skeleton();
+    let clip = walker(&skeleton, 0.0);
+    let n = clip.len();
+    // A metre ahead becomes 0.4 m to the left: with -y ahead, x is left.
+    let stride = vec![Vec2::new(0.0, 0.4); n];
+    let path = bent_path(&clip, &vec![0.0; n], &stride);
+    let spread = sideways_spread(&clip, &stride);
+    // A cycle of 44 frames at 1 m/s is 1.1 m long, 0.44 m sideways, a quarter of it either way.
+    assert!(spread.iter().all(|s| (s - 0.11).abs() < 1e-3), "{spread:?}");
+    let out = replant(&skeleton, &clip, &path, &spread);
+    let (a, b) = (out.poses[0].root, out.poses[n - 1].root);
+    assert!((b.x - a.x - 0.4 * 159.0 / 40.0).abs() < 1e-3 && (b.y - a.y).abs() < 1e-3);
+    assert!(quantile(&slides(&skeleton, &out), 1.0) < 0.002);
+    for t in 0..n {
+        let [l, r] = [0, 1].map(|side| skeleton.foot(&out.poses[t], side).ankle);
+        assert!(l.x - r.x > 0.15, "the feet cross at {t}: {}", l.x - r.x);
+    }
+}
+
+#[test]
+fn a_stander_lends_the_upper_body() {
+    let skeleton = skeleton();
+    let clip = walker(&skeleton, 0.0);
+    let mut idle = clip.clone();
+    // Somebody who faces x with straight legs, bent at the waist and swaying to the right.
+    let turned = flat(std::f32::consts::FRAC_PI_2);
+    for pose in &mut idle.poses {
+        *pose = Pose { root: Vec3::new(0.0, -0.03, 0.9), rots: [turned; BODY_JOINTS] };
+        pose.rots[9] = turned * Quat::from_rotation_x(0.3);
+    }
+    let out = stand_idly(&skeleton, &clip, &idle, 0, &vec![1.0; clip.len()]);
+    let none = stand_idly(&skeleton, &clip, &idle, 0, &vec![0.0; clip.len()]);
+    assert!(worst(&skeleton, &none, &clip) < 1e-4);
+    for (p, old) in out.poses.iter().zip(&clip.poses) {
+        let bend = p.rots[6].inverse() * p.rots[9];
+        assert!(bend.angle_between(Quat::from_rotation_x(0.3)) < 1e-3);
+        for side in 0..SIDES {
+            assert!((skeleton.foot(p, side).ankle - skeleton.foot(old, side).ankle).length() < 0.01);
+        }
+    }
 }

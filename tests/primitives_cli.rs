@@ -6,7 +6,8 @@ use egogen::motion::primitive::{ClipMarkers, JOINT_DIM, MotionSet};
 use egogen::sim::World;
 use egogen_envs::motion::{MotionEnv, MotionTask};
 use egogen_train::evaluate::{Actor, play};
-use egogen_train::primitives::fit::{Outcome, Run, Settings};
+use egogen_train::primitives::fit::{Outcome, Run};
+use egogen_train::primitives::settings::Settings;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -43,9 +44,9 @@ fn an_interrupted_training_goes_on_to_the_same_weights() {
     let (whole, pieces) = (dir.path().join("whole"), dir.path().join("pieces"));
     let settings = Settings { steps: [12, 40, 16], batch: [32, 64, 32], ..Default::default() };
     let go_on = AtomicBool::new(false);
-    assert_eq!(Run::new(&set, &body, settings.clone(), &whole).train(&go_on).unwrap(), Outcome::Done);
+    assert_eq!(Run::new(&set, &set, &body, settings.clone(), &whole).train(&go_on).unwrap(), Outcome::Done);
     let mut interruptions = 0;
-    let mut run = Run::new(&set, &body, settings, &pieces);
+    let mut run = Run::new(&set, &set, &body, settings, &pieces);
     loop {
         let stop = AtomicBool::new(false);
         let outcome = std::thread::scope(|s| {
@@ -59,7 +60,7 @@ fn an_interrupted_training_goes_on_to_the_same_weights() {
             break;
         }
         interruptions += 1;
-        run = Run::resume(&set, &body, &pieces).unwrap();
+        run = Run::resume(&set, &set, &body, &pieces).unwrap();
     }
     assert!(interruptions > 0, "was never interrupted");
     let states = [&whole, &pieces].map(|dir| Tensors::read(dir.join("state.safetensors")).unwrap());
@@ -84,9 +85,10 @@ fn a_folder_without_recordings_and_a_damaged_state_are_refused() {
     fails(&["train", "--data", "nowhere", "--out", "out"], "nowhere");
     fails(&["eval", "--data", ".", "--model", "out"], "cmu_expmap");
     fails(&["train", "--data", ".", "--out", "out", "--klx", "1"], "--klx");
+    fails(&["train", "--data", ".", "--out", "out", "--set", "loss.klx=1"], "klx");
     assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 0, "nothing is left behind");
     fs::write(dir.path().join("state.safetensors"), b"\x08\0\0\0\0\0\0\0{}").unwrap();
-    let message = Run::resume(&wandering(), &BodyModel::embedded(), dir.path()).err().unwrap().to_string();
+    let message = Run::resume(&wandering(), &wandering(), &BodyModel::embedded(), dir.path()).err().unwrap().to_string();
     assert!(message.contains("state.safetensors"), "{message}");
 }
 
@@ -94,12 +96,14 @@ fn a_folder_without_recordings_and_a_damaged_state_are_refused() {
 fn recordings(dir: &Path) -> Option<PathBuf> {
     let shared =
         std::env::var_os("EGOGEN_SHARED").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared"), PathBuf::from);
-    let archive = shared.join("data/mocap-cmu.tar.gz");
-    if !archive.is_file() {
-        println!("skipped: no {} (set EGOGEN_SHARED)", archive.display());
-        return None;
+    for name in ["mocap-cmu", "mocap-idle"] {
+        let archive = shared.join(format!("data/{name}.tar.gz"));
+        if !archive.is_file() {
+            println!("skipped: no {} (set EGOGEN_SHARED)", archive.display());
+            return None;
+        }
+        assert!(Command::new("tar").arg("xzf").arg(archive).arg("-C").arg(dir).status().unwrap().success());
     }
-    assert!(Command::new("tar").arg("xzf").arg(archive).arg("-C").arg(dir).status().unwrap().success());
     Some(dir.join("mocap"))
 }
 

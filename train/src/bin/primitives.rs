@@ -6,10 +6,12 @@ use egogen::io::{Tensors, write_atomic};
 use egogen::kernels::MotionEngine;
 use egogen::motion::{self, MotionSet, MotionWeights, PosePrior};
 use egogen::sim::Sim;
+use egogen_train::primitives::bodies;
 use egogen_train::primitives::eval::{Effort, evaluate};
-use egogen_train::primitives::fit::{Outcome, Run, Settings};
+use egogen_train::primitives::fit::{Outcome, Run};
 use egogen_train::primitives::pose;
 use egogen_train::primitives::seeds::make_seeds;
+use egogen_train::primitives::settings::Settings;
 use egogen_train::program::{self, Given, INTERRUPTED};
 use egogen_train::{Error, Result};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -34,6 +36,8 @@ enum Command {
     Eval(Eval),
     /// Train a pose prior (VPoser's form) on the recorded poses, choose its threshold, and judge it.
     Pose(Pose),
+    /// Compare a regressor that is told the body's shape with regressors of one body each.
+    Bodies(Bodies),
     /// Write seeds.safetensors, seeds for the walking task made by the model, into its folder.
     Seeds(Seeds),
 }
@@ -77,11 +81,20 @@ struct Pose {
     seed: u64,
 }
 
+#[derive(Args)]
+struct Bodies {
+    #[command(flatten)]
+    data: Data,
+    /// Updates of each regressor.
+    #[arg(long, default_value_t = 3000)]
+    steps: u64,
+}
+
 const EFFORT: Effort = Effort { people: 1000, episodes: 200 };
 
 #[derive(Args)]
 struct Data {
-    /// Folder with the unpacked mocap-cmu archive.
+    /// Folder with the unpacked mocap-cmu and mocap-idle archives.
     #[arg(long, value_name = "DIR")]
     data: PathBuf,
     /// Seed of the data's augmentation.
@@ -96,21 +109,12 @@ struct Train {
     /// Folder for weights, training state, curves and figures.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Train by the clock for this long instead of by the number of updates.
-    #[arg(long)]
-    minutes: Option<f64>,
-    /// Root of all random streams.
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
-    /// Weight of the divergence from the prior.
-    #[arg(long)]
-    kl: Option<f32>,
-    /// Weight of the loss against sliding feet.
-    #[arg(long)]
-    skate: Option<f32>,
-    /// Weight of the loss against sliding of the prior's samples.
-    #[arg(long)]
-    contact: Option<f32>,
+    /// `default` or a path ending in .toml.
+    #[arg(long, default_value = "default", conflicts_with = "resume")]
+    recipe: String,
+    /// Change a value of the recipe; may be given several times.
+    #[arg(long, value_name = "KEY=VALUE", conflicts_with = "resume")]
+    set: Vec<String>,
     /// Start with the networks of this motion-model folder.
     #[arg(long, value_name = "DIR", conflicts_with = "resume")]
     start_from: Option<PathBuf>,
@@ -133,6 +137,7 @@ fn run(command: Command) -> Result<u8> {
             Ok(0)
         }
         Command::Pose(args) => train_pose(&args),
+        Command::Bodies(args) => compare_bodies(&args),
         Command::Seeds(args) => {
             let body = BodyModel::embedded();
             let (set, ..) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
@@ -161,17 +166,14 @@ fn write_seeds(model: &Path, body: &Arc<BodyModel>, set: &MotionSet) -> Result<(
 }
 
 fn train(args: Train) -> Result<u8> {
+    let settings = Settings::load(&args.recipe, &args.set)?;
     let body = BodyModel::embedded();
     let (set, held_out, report) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
     eprintln!("{report}");
     let mut run = if args.resume {
-        Run::resume(&set, &body, &args.out).given()?
+        Run::resume(&set, &held_out, &body, &args.out).given()?
     } else {
-        let mut settings = Settings { seed: args.seed, minutes: args.minutes, ..Default::default() };
-        settings.loss.kl = args.kl.unwrap_or(settings.loss.kl);
-        settings.loss.skate = args.skate.unwrap_or(settings.loss.skate);
-        settings.loss.contact = args.contact.unwrap_or(settings.loss.contact);
-        let fresh = Run::new(&set, &body, settings, &args.out);
+        let fresh = Run::new(&set, &held_out, &body, settings, &args.out);
         match &args.start_from {
             Some(dir) => fresh.start_from(dir).given()?,
             None => fresh,
@@ -189,11 +191,30 @@ fn train(args: Train) -> Result<u8> {
     Ok(0)
 }
 
+fn compare_bodies(args: &Bodies) -> Result<u8> {
+    let body = BodyModel::embedded();
+    let (set, held_out, _) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
+    let settings = Settings::load("default", &[format!("steps=[1, {}, 1]", args.steps)])?;
+    let bar = update_bar(args.steps);
+    let compared = bodies::compare(&set, &held_out, &body, &settings, |name, step| {
+        bar.set_position(step);
+        bar.set_message(name.to_string());
+    })?;
+    bar.finish();
+    println!("{}", serde_json::to_string_pretty(&compared).map_err(|e| Error::run(e.to_string()))?);
+    Ok(0)
+}
+
+/// A bar over `steps` updates.
+fn update_bar(steps: u64) -> ProgressBar {
+    let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} {msg}, {eta} left").unwrap_or(ProgressStyle::default_bar());
+    ProgressBar::new(steps).with_style(style)
+}
+
 fn train_pose(args: &Pose) -> Result<u8> {
     let body = BodyModel::embedded();
     let (set, held_out, _) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
-    let bar = ProgressBar::new(args.steps)
-        .with_style(ProgressStyle::with_template("{wide_bar} {pos}/{len} {msg}, {eta} left").unwrap_or(ProgressStyle::default_bar()));
+    let bar = update_bar(args.steps);
     let tensors = pose::train(&set, args.steps, args.seed, |step, [error, divergence]| {
         bar.set_position(step);
         let text = format!("matrix error {error:.4}, {divergence:.1} nats");

@@ -1,10 +1,14 @@
 //! The training run: three stages, checkpoints, resuming.
 
 use super::adam::{Adam, merge};
+use super::eval::held_out_error;
 use super::loss::{self, LossParts, LossWeights};
 use super::progress::Progress;
 use super::sample::{BodySource, Lanes, SHARD};
+use super::settings::Settings;
 use super::{init, predictor, regressor};
+use crate::Result;
+use egogen::Error;
 use egogen::body::rotation::to_6d;
 use egogen::body::{BodyModel, MARKER_DIM, ShapedBody};
 use egogen::io::{Precision, Tensors, pack_tensors, write_atomic};
@@ -13,7 +17,6 @@ use egogen::motion::{
     CONTINUOUS, MotionConfig, MotionSet, MotionWeights, Parameters, PredictorSizes, PredictorWeights, RegressorSizes, RegressorWeights,
 };
 use egogen::rng::stream;
-use egogen::{Error, Result};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -34,42 +37,6 @@ pub enum Stage {
 }
 
 const STAGES: [Stage; 3] = [Stage::Single, Stage::Body, Stage::Rollout];
-
-/// What a run does; the whole of it is kept in its checkpoints.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Settings {
-    /// Root of all random streams.
-    pub seed: u64,
-    /// Updates of the stages.
-    pub steps: [u64; 3],
-    /// Minutes for all stages; when given, stages end by the clock (and the result is not repeatable to the bit).
-    pub minutes: Option<f64>,
-    /// Share of the minutes of each stage.
-    pub shares: [f64; 3],
-    /// People (or, for the regressor, bodies) of a batch.
-    pub batch: [usize; 3],
-    /// Learning rate at the start and the end of each stage, linear between.
-    pub rates: [[f32; 2]; 3],
-    /// Consecutive primitives of a roll-out.
-    pub depth: usize,
-    /// Weights of the predictor's loss.
-    pub loss: LossWeights,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self {
-            seed: 0,
-            steps: [6000, 8000, 5000],
-            minutes: None,
-            shares: [0.4, 0.15, 0.45],
-            batch: [64, 256, 64],
-            rates: [[1e-3, 3e-4], [1e-3, 2e-5], [5e-4, 1e-5]],
-            depth: 4,
-            loss: LossWeights::default(),
-        }
-    }
-}
 
 /// A network with its optimiser.
 struct Trained<P> {
@@ -101,6 +68,7 @@ pub enum Outcome {
 /// A training run.
 pub struct Run<'a> {
     set: &'a MotionSet,
+    held_out: &'a MotionSet,
     model: &'a BodyModel,
     body: ShapedBody,
     predictor: Trained<PredictorWeights>,
@@ -112,16 +80,19 @@ pub struct Run<'a> {
 const STATE: &str = "state.safetensors";
 /// Time between checkpoints.
 const SAVE_EVERY: Duration = Duration::from_secs(120);
+/// Updates of the predictor between looks at held-out motion.
+const WATCH_EVERY: u64 = 500;
 
 impl<'a> Run<'a> {
-    /// Fresh networks.
-    pub fn new(set: &'a MotionSet, model: &'a BodyModel, settings: Settings, out: impl Into<PathBuf>) -> Self {
+    /// Fresh networks, to be trained on `set` and watched on `held_out`.
+    pub fn new(set: &'a MotionSet, held_out: &'a MotionSet, model: &'a BodyModel, settings: Settings, out: impl Into<PathBuf>) -> Self {
         let source = BodySource::new(set, model, settings.seed);
         let (markers, pose) = means(&source, settings.seed);
         let predictor = init::predictor(PredictorSizes::default(), settings.seed, &markers);
         let regressor = init::regressor(RegressorSizes::default(), settings.seed, &markers, &pose);
         Self {
             set,
+            held_out,
             model,
             body: source.shapes[0].clone(),
             predictor: Trained { adam: Adam::new(&predictor), weights: predictor },
@@ -136,20 +107,20 @@ impl<'a> Run<'a> {
         let w = MotionWeights::load(dir)?;
         let c = MotionConfig::new(self.model.hash());
         if w.config != c {
-            return Err(Error::file(dir, format!("holds a model of {:?}, expected {c:?}", w.config)));
+            return Err(Error::file(dir, format!("holds a model of {:?}, expected {c:?}", w.config)).into());
         }
         (self.predictor.weights, self.regressor.weights) = (w.predictor, w.regressor);
         Ok(self)
     }
 
     /// Goes on where the checkpoint in `out` left off, with its settings.
-    pub fn resume(set: &'a MotionSet, model: &'a BodyModel, out: impl Into<PathBuf>) -> Result<Self> {
+    pub fn resume(set: &'a MotionSet, held_out: &'a MotionSet, model: &'a BodyModel, out: impl Into<PathBuf>) -> Result<Self> {
         let out = out.into();
         let t = Tensors::read(out.join(STATE))?;
         let bad = |e: String| Error::file(t.origin(), e);
         let place = t.metadata().get("place").cloned().ok_or_else(|| bad("has no metadata entry 'place': not a training state".into()))?;
         let place: Place = serde_json::from_str(&place).map_err(|e| bad(format!("metadata entry 'place': {e}")))?;
-        let mut run = Self::new(set, model, place.settings.clone(), out);
+        let mut run = Self::new(set, held_out, model, place.settings.clone(), out);
         run.place = place;
         run.predictor.read(&t, "predictor")?;
         run.regressor.read(&t, "regressor")?;
@@ -200,8 +171,8 @@ impl<'a> Run<'a> {
         let s = self.place.settings.clone();
         let rows = s.batch[self.place.stage];
         // Early samples of the prior have no feet to speak of.
-        let loss_weights = LossWeights { contact: if depth > 1 { s.loss.contact } else { 0.0 }, ..s.loss };
-        let mut lanes = Lanes::new(self.set, rows, depth)?;
+        let loss_weights = LossWeights { slide: if depth > 1 { s.loss.slide } else { 0.0 }, ..s.loss };
+        let mut lanes = Lanes::new(self.set, rows, depth, s.favour)?;
         let regressor = Regressor::new(&self.regressor.weights)?;
         let mut shards: Vec<(predictor::Tape, PredictorWeights)> =
             (0..rows.div_ceil(SHARD)).map(|_| (predictor::Tape::default(), self.predictor.weights.zeros())).collect();
@@ -224,12 +195,15 @@ impl<'a> Run<'a> {
             rest.iter_mut().for_each(|(_, g)| merge(&mut first[0].1, g));
             let rate = self.rate(fraction);
             self.predictor.adam.update(&mut self.predictor.weights, &mut first[0].1, rate);
-            lanes.advance(&shards.iter().map(|(t, _)| &t.frames[..]).collect::<Vec<_>>(), &self.body, &regressor)?;
+            lanes.advance(&shards.iter().map(|(t, _)| &t.frames[..]).collect::<Vec<_>>(), &self.body, &regressor, s.frames)?;
             self.place.step += 1;
             let share = 1.0 / parts.len() as f32;
             let mean = |f: fn(&LossParts) -> f32| parts.iter().map(f).sum::<f32>() * share;
-            let figures = [mean(|p| p.reconstruction), mean(|p| p.velocity), mean(|p| p.kl), mean(|p| p.skate), mean(|p| p.contact)];
+            let figures = [mean(|p| p.reconstruction), mean(|p| p.velocity), mean(|p| p.kl), mean(|p| p.skate), mean(|p| p.slide)];
             progress.step(self.place.step, fraction, rate, &figures)?;
+            if self.place.step.is_multiple_of(WATCH_EVERY) {
+                progress.held_out(self.place.step, held_out_error(&self.predictor.weights, self.held_out)?)?;
+            }
         }
     }
 
@@ -298,7 +272,8 @@ impl<'a> Run<'a> {
         let place = serde_json::to_string(&self.place).map_err(|e| Error::invalid(e.to_string()))?;
         let metadata = BTreeMap::from([("place".to_string(), place)]);
         write_atomic(self.out.join(STATE), &pack_tensors(&tensors, &metadata, Precision::Full)?)?;
-        MotionWeights::save(&self.out, &MotionConfig::new(self.model.hash()), &self.predictor.weights, &self.regressor.weights)
+        MotionWeights::save(&self.out, &MotionConfig::new(self.model.hash()), &self.predictor.weights, &self.regressor.weights)?;
+        Ok(())
     }
 
     /// The folder that the run writes.
@@ -308,7 +283,7 @@ impl<'a> Run<'a> {
 }
 
 /// Forward and backward of `rows` of a batch's `all` bodies; sums for the batch's mean loss and marker distance.
-fn regressor_step(
+pub(super) fn regressor_step(
     w: &RegressorWeights,
     grad: &mut RegressorWeights,
     tape: &mut regressor::Tape,
@@ -332,7 +307,7 @@ fn regressor_step(
 }
 
 /// Mean markers and mean body in continuous form of the set, from 2,000 draws.
-fn means(source: &BodySource, seed: u64) -> (Vec<f32>, [f32; CONTINUOUS]) {
+pub(super) fn means(source: &BodySource, seed: u64) -> (Vec<f32>, [f32; CONTINUOUS]) {
     let rng = &mut stream(seed, "means", 0);
     let n = 2000;
     let (mut markers, mut body) = (vec![0.0; MARKER_DIM], [0.0; CONTINUOUS]);

@@ -1,6 +1,7 @@
 //! Training and evaluation of the motion-primitive model.
 
 pub mod adam;
+pub mod bodies;
 pub mod eval;
 pub mod fit;
 pub mod gait;
@@ -13,3 +14,4 @@ pub mod progress;
 pub mod regressor;
 pub mod sample;
 pub mod seeds;
+pub mod settings;

@@ -1,8 +1,11 @@
-//! What a run says while it runs: a bar (or lines, away from a terminal) and a CSV file.
+//! What a run says while it runs: a bar (or lines, away from a terminal), CSV files and TensorBoard.
 
 use super::fit::Stage;
+use crate::Result;
+use crate::logger::Logger;
+use crate::tensorboard::TensorBoard;
+use egogen::Error;
 use egogen::io::write_atomic;
-use egogen::{Error, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::fs::{self, File, OpenOptions};
 use std::io::{IsTerminal, Write, stderr};
@@ -26,6 +29,7 @@ pub struct Progress {
     line: Instant,
     /// Running means of the figures.
     mean: Vec<f64>,
+    board: TensorBoard,
 }
 
 impl Progress {
@@ -33,7 +37,7 @@ impl Progress {
     pub fn new(out: &Path, stage: Stage, step: u64) -> Result<Self> {
         let names: &[&str] = match stage {
             Stage::Body => &["loss", "marker_distance"],
-            _ => &["reconstruction", "velocity", "kl", "skate", "contact"],
+            _ => &["reconstruction", "velocity", "kl", "skate", "slide"],
         };
         let path = out.join(format!("{}.csv", format!("{stage:?}").to_lowercase()));
         fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;
@@ -49,7 +53,19 @@ impl Progress {
             ProgressBar::new(1000).with_style(style).with_prefix(format!("{stage:?}"))
         });
         let now = Instant::now();
-        Ok(Self { stage, names, bar, path, file, start: now, first: f64::NAN, line: now, mean: Vec::new() })
+        let board = TensorBoard::new(&out.join("tensorboard"))?;
+        Ok(Self { stage, names, bar, path, file, start: now, first: f64::NAN, line: now, mean: Vec::new(), board })
+    }
+
+    /// Takes note of the distance from held-out motion after update `step`: of the posterior mean, mm, over all frames and in the last.
+    pub fn held_out(&mut self, step: u64, distance: [f32; 2]) -> Result<()> {
+        self.scalars(step, &["held_out_mm", "held_out_last_mm"], &distance.map(f64::from))
+    }
+
+    fn scalars(&mut self, step: u64, names: &[&str], values: &[f64]) -> Result<()> {
+        let stage = format!("{:?}", self.stage).to_lowercase();
+        let row = names.iter().zip(values).map(|(n, v)| (format!("{stage}/{n}"), Some(*v))).collect();
+        self.board.log(step, &row)
     }
 
     /// Takes note of update `step`; `fraction` of the stage is done.
@@ -62,6 +78,7 @@ impl Progress {
         if step.is_multiple_of(ROW_EVERY) {
             let figures: Vec<String> = self.mean.iter().map(|v| format!("{v:.6}")).collect();
             writeln!(self.file, "{step},{rate:.3e},{}", figures.join(",")).map_err(|e| Error::io(&self.path, e))?;
+            self.scalars(step, self.names, &self.mean.clone())?;
         }
         if let Some(bar) = &self.bar {
             bar.set_position((1000.0 * fraction) as u64);

@@ -2,6 +2,7 @@
 
 use super::predictor::Batch;
 use super::regressor::Truth;
+use super::settings::Frames;
 use egogen::body::{BETAS, BodyModel, Frame, MARKER_DIM, PARAMS, ShapedBody, TRANSL, canonical_frame, joint};
 use egogen::kernels::{Decoder, Regressor};
 use egogen::motion::{FRAMES, FUTURE, LATENT, MotionSet, SEED};
@@ -29,61 +30,64 @@ fn put(to: &mut [f32], rows: usize, t: usize, row: usize, frame: &[f32]) {
     to[at..at + MARKER_DIM].copy_from_slice(frame);
 }
 
-/// How strongly rare manoeuvres are favoured: a manoeuvre seen n times is drawn as if seen n^(1 - this) times. Recorded people
-/// mostly go on as they are; a prior that does so too can hardly be steered.
-const FAVOUR: f32 = 0.6;
-
-/// The manoeuvre of the primitive at `start`: classes of speed, change of speed, and turn.
-fn manoeuvre(set: &MotionSet, clip: usize, start: usize) -> [i32; 3] {
+/// The manoeuvre of the primitive at `start`: classes of speed, change of speed, sideways speed, and turn.
+fn manoeuvre(set: &MotionSet, clip: usize, start: usize) -> [i32; 4] {
     let frame = |t: usize| set.frame(clip, start + t);
-    let half = |a: usize, b: usize| frame(a).inverse().point(frame(b).transl).y;
-    let (first, second) = (half(0, FRAMES / 2), half(FRAMES / 2, FRAMES - 1));
+    let way = |a: usize, b: usize| frame(a).inverse().point(frame(b).transl);
+    let half = |a: usize, b: usize| way(a, b).y;
+    let (first, second, side) = (half(0, FRAMES / 2), half(FRAMES / 2, FRAMES - 1), way(0, FRAMES - 1).x);
     let x = frame(0).inverse().dir(frame(FRAMES - 1).rot.x_axis);
     let class = |v: f32, width: f32, most: i32| ((v / width).round() as i32).clamp(-most, most);
-    // Half a primitive takes a quarter of a second: 0.3 m/s, 0.25 m/s and 10 degrees.
-    [class(first, 0.075, 6), class(second - first, 0.06, 4), class(x.y.atan2(x.x), 10f32.to_radians(), 5)]
+    // Half a primitive takes a quarter of a second: 0.3 m/s, 0.25 m/s, 0.2 m/s and 10 degrees.
+    let turn = x.y.atan2(x.x);
+    [class(first, 0.075, 6), class(second - first, 0.06, 4), class(side, 0.1, 2), class(turn, 10f32.to_radians(), 5)]
 }
 
-/// Weights that even out how often each class is drawn.
-fn even_out(classes: &[[i32; 3]]) -> Vec<f32> {
+/// Weights that even out how often each class is drawn (see [`Settings::favour`](super::settings::Settings)).
+fn even_out(classes: &[[i32; 4]], favour: f32) -> Vec<f32> {
     let mut counts = BTreeMap::new();
     classes.iter().for_each(|c| *counts.entry(c).or_insert(0u32) += 1);
-    classes.iter().map(|c| (counts[c] as f32).powf(-FAVOUR)).collect()
+    classes.iter().map(|c| (counts[c] as f32).powf(-favour)).collect()
 }
 
-/// A batch of people who each walk through `depth` consecutive primitives of a clip, then start anew.
+/// A batch of people who each walk through up to `depth` consecutive primitives of a clip, then start anew, as they do where their
+/// clip ends before.
 pub struct Lanes<'a> {
     set: &'a MotionSet,
     windows: Vec<(usize, usize)>,
     /// Running sum of the windows' weights.
     weights: Vec<f64>,
     depth: u64,
-    rows: usize,
     at: Vec<(usize, usize)>,
+    /// Who starts anew in this step.
+    fresh: Vec<bool>,
     /// rows x 2 x 201: where the predictions led.
     seeds: Vec<f32>,
 }
 
 impl<'a> Lanes<'a> {
-    /// `rows` people through `depth` primitives each.
-    pub fn new(set: &'a MotionSet, rows: usize, depth: usize) -> Result<Self> {
-        let windows = set.windows(SEED + depth * FUTURE, 1);
+    /// `rows` people through up to `depth` primitives each; `favour` as in [`Settings`](super::settings::Settings).
+    pub fn new(set: &'a MotionSet, rows: usize, depth: usize, favour: f32) -> Result<Self> {
+        let windows = set.windows(FRAMES, 1);
         if windows.is_empty() {
-            return Err(Error::invalid(format!("no clip holds {} frames", SEED + depth * FUTURE)));
+            return Err(Error::invalid(format!("no clip holds {FRAMES} frames")));
         }
-        // A window of several primitives counts as the mean of them.
-        let singles = set.windows(FRAMES, 1);
-        let classes: Vec<[i32; 3]> = singles.par_iter().map(|&(clip, start)| manoeuvre(set, clip, start)).collect();
-        let single: BTreeMap<(usize, usize), f32> = singles.into_iter().zip(even_out(&classes)).collect();
-        let weight = |clip: usize, start: usize| -> f32 { (0..depth).map(|k| single[&(clip, start + k * FUTURE)]).sum() };
-        let weights = windows
-            .iter()
-            .scan(0.0, |sum, &(clip, start)| {
-                *sum += f64::from(weight(clip, start));
-                Some(*sum)
-            })
-            .collect();
-        Ok(Self { set, windows, weights, depth: depth as u64, rows, at: Vec::new(), seeds: vec![0.0; rows * SEED_DIM] })
+        let classes: Vec<[i32; 4]> = windows.par_iter().map(|&(clip, start)| manoeuvre(set, clip, start)).collect();
+        let single: BTreeMap<(usize, usize), f32> = windows.iter().copied().zip(even_out(&classes, favour)).collect();
+        // A start counts as the mean of the primitives that follow.
+        let weight = |&(clip, start): &(usize, usize)| -> f64 {
+            let (sum, n) = (0..depth)
+                .filter_map(|k| single.get(&(clip, start + k * FUTURE)))
+                .fold((0.0, 0), |(sum, n), w| (sum + f64::from(*w), n + 1));
+            sum / f64::from(n)
+        };
+        let running = |sum: &mut f64, w: &(usize, usize)| {
+            *sum += weight(w);
+            Some(*sum)
+        };
+        let weights = windows.iter().scan(0.0, running).collect();
+        let (at, fresh, seeds) = (vec![(0, 0); rows], vec![true; rows], vec![0.0; rows * SEED_DIM]);
+        Ok(Self { set, windows, weights, depth: depth as u64, at, fresh, seeds })
     }
 
     /// Whether `step` starts anew, so that training may be cut there.
@@ -93,20 +97,23 @@ impl<'a> Lanes<'a> {
 
     /// The shards of step `step`: true futures in the true canonical frames, seeds as the model left them.
     pub fn batch(&mut self, seed: u64, step: u64) -> Vec<Batch> {
-        let k = step % self.depth;
-        if k == 0 {
-            let rng = &mut stream(seed, "windows", step);
-            let total = self.weights[self.weights.len() - 1];
-            let at = |r: f64| self.windows[self.weights.partition_point(|&w| w <= r).min(self.windows.len() - 1)];
-            self.at = (0..self.rows).map(|_| at(rng.random_range(0.0..total))).collect();
+        let begins = self.is_start(step);
+        let rng = &mut stream(seed, "windows", step);
+        let total = self.weights[self.weights.len() - 1];
+        for (at, fresh) in self.at.iter_mut().zip(&mut self.fresh) {
+            at.1 += FUTURE;
+            *fresh = begins || at.1 + FRAMES > self.set.clips[at.0].len();
+            if *fresh {
+                let r = rng.random_range(0.0..total);
+                *at = self.windows[self.weights.partition_point(|&w| w <= r).min(self.windows.len() - 1)];
+            }
         }
-        let shift = k as usize * FUTURE;
-        let shards: Vec<usize> = (0..self.rows).step_by(SHARD).collect();
-        shards.par_iter().map(|&first| self.shard(first, shift, &mut stream(seed, "latent noise", step << 16 | first as u64))).collect()
+        let shards: Vec<usize> = (0..self.at.len()).step_by(SHARD).collect();
+        shards.par_iter().map(|&first| self.shard(first, &mut stream(seed, "latent noise", step << 16 | first as u64))).collect()
     }
 
-    fn shard(&self, first: usize, shift: usize, rng: &mut Stream) -> Batch {
-        let rows = SHARD.min(self.rows - first);
+    fn shard(&self, first: usize, rng: &mut Stream) -> Batch {
+        let rows = SHARD.min(self.at.len() - first);
         let mut b = Batch {
             rows,
             seed: vec![0.0; rows * SEED_DIM],
@@ -116,9 +123,9 @@ impl<'a> Lanes<'a> {
         let mut window = vec![0.0; FRAMES * MARKER_DIM];
         for row in 0..rows {
             let (clip, start) = self.at[first + row];
-            self.set.canonical_window(clip, start + shift, FRAMES, &mut window);
+            self.set.canonical_window(clip, start, FRAMES, &mut window);
             let own = &self.seeds[(first + row) * SEED_DIM..(first + row + 1) * SEED_DIM];
-            let seed = if shift == 0 { &window[..SEED_DIM] } else { own };
+            let seed = if self.fresh[first + row] { &window[..SEED_DIM] } else { own };
             for (t, frame) in seed.chunks_exact(MARKER_DIM).enumerate() {
                 put(&mut b.seed, rows, t, row, frame);
             }
@@ -130,13 +137,13 @@ impl<'a> Lanes<'a> {
     }
 
     /// Takes the last predicted frames of each shard (time-major, as `Tape::frames`) as the next seeds.
-    pub fn advance(&mut self, ends: &[&[f32]], body: &ShapedBody, regressor: &Regressor) -> Result<()> {
+    pub fn advance(&mut self, ends: &[&[f32]], body: &ShapedBody, regressor: &Regressor, frames: Frames) -> Result<()> {
         if self.depth == 1 {
             return Ok(());
         }
         for (i, frames) in ends.iter().enumerate() {
             let first = i * SHARD;
-            let rows = SHARD.min(self.rows - first);
+            let rows = SHARD.min(self.at.len() - first);
             let last = &frames[frames.len() - SEED * rows * MARKER_DIM..];
             let seeds = &mut self.seeds[first * SEED_DIM..(first + rows) * SEED_DIM];
             for (row, seed) in seeds.chunks_exact_mut(SEED_DIM).enumerate() {
@@ -145,22 +152,29 @@ impl<'a> Lanes<'a> {
                 }
             }
         }
-        reseed(&mut self.seeds, body, regressor)
+        let next = |&(clip, start): &(usize, usize)| {
+            // Whose clip ends here starts anew in any case.
+            let end = (start + FUTURE).min(self.set.clips[clip].len() - 1);
+            self.set.frame(clip, end).inverse().compose(&self.set.frame(clip, start))
+        };
+        let truth: Option<Vec<Frame>> = (frames == Frames::Truth).then(|| self.at.iter().map(next).collect());
+        reseed(&mut self.seeds, body, regressor, truth.as_deref())
     }
 }
 
 /// Turns the last frames of predictions (n x 2 x 201) into the next seeds exactly as the simulation does: half predicted markers,
-/// half those of the regressed body, in the canonical frame of the regressed body.
-pub fn reseed(seeds: &mut [f32], body: &ShapedBody, regressor: &Regressor) -> Result<()> {
+/// half those of the regressed body, in the canonical frame of the regressed body; or in the frames `locals` (n, from the old
+/// canonical frames) where given.
+pub fn reseed(seeds: &mut [f32], body: &ShapedBody, regressor: &Regressor, locals: Option<&[Frame]>) -> Result<()> {
     let frames = seeds.len() / MARKER_DIM;
     let betas = body.betas().repeat(frames);
     let mut params = vec![0.0; frames * PARAMS];
     regressor.regress(seeds, &betas, &mut params)?;
-    seeds.par_chunks_mut(SEED_DIM).zip(params.par_chunks(SEED * PARAMS)).for_each(|(seed, params)| {
-        let mut local = Frame::IDENTITY;
+    seeds.par_chunks_mut(SEED_DIM).zip(params.par_chunks(SEED * PARAMS)).enumerate().for_each(|(i, (seed, params))| {
+        let mut local = locals.map_or(Frame::IDENTITY, |l| l[i]);
         for (t, (frame, params)) in seed.chunks_exact_mut(MARKER_DIM).zip(params.chunks_exact(PARAMS)).enumerate() {
             let posed = body.pose(params);
-            if t == 0 {
+            if t == 0 && locals.is_none() {
                 local = canonical_frame(posed.pos[joint::PELVIS], posed.pos[joint::L_HIP], posed.pos[joint::R_HIP]).inverse();
             }
             let mut skin = [0.0; MARKER_DIM];
@@ -190,6 +204,8 @@ pub struct BodySource<'a> {
     set: &'a MotionSet,
     /// The mean shape first.
     pub shapes: Vec<ShapedBody>,
+    /// The only shape to draw, or all, the mean one half of the time.
+    only: Option<usize>,
     /// Frames of markers predicted from the prior, for the mean shape.
     predicted: Vec<f32>,
 }
@@ -202,7 +218,12 @@ const NOISE: f32 = 0.015;
 impl<'a> BodySource<'a> {
     pub fn new(set: &'a MotionSet, model: &BodyModel, seed: u64) -> Self {
         let shape = |i| if i == 0 { vec![0.0; BETAS] } else { normals(&mut stream(seed, "shapes", i), BETAS) };
-        Self { set, shapes: (0..SHAPES).map(|i| model.shape(&shape(i))).collect(), predicted: Vec::new() }
+        Self { set, shapes: (0..SHAPES).map(|i| model.shape(&shape(i))).collect(), only: None, predicted: Vec::new() }
+    }
+
+    /// Draws the shape of `betas` (10) alone, which is the second of the shapes.
+    pub fn one(set: &'a MotionSet, model: &BodyModel, betas: &[f32]) -> Self {
+        Self { set, shapes: vec![model.shape(&[0.0; BETAS]), model.shape(betas)], only: Some(1), predicted: Vec::new() }
     }
 
     /// Replaces the predicted frames by fresh ones of the prior.
@@ -230,7 +251,8 @@ impl<'a> BodySource<'a> {
                 b.truth.push(Truth { markers, pose: None });
                 b.shape.push(0);
             } else {
-                let shape = if rng.random() { 0 } else { rng.random_range(0..self.shapes.len()) };
+                let any = if rng.random() { 0 } else { rng.random_range(0..self.shapes.len()) };
+                let shape = self.only.unwrap_or(any);
                 let truth = self.recorded(shape, rng);
                 let noise = (NOISE * rng.random_range(-0.5..1.0f32)).max(0.0);
                 b.markers.extend(truth.markers.iter().map(|v| v + noise * rng.sample::<f32, _>(StandardNormal)));
@@ -286,7 +308,8 @@ mod tests {
 
     #[test]
     fn rare_classes_are_favoured() {
-        let w = even_out(&[[0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1], [2, 0, 0]]);
+        let (common, rare) = ([0, 0, 0, 1], [2, 0, 0, 0]);
+        let w = even_out(&[common, common, common, common, rare], 0.6);
         // Together the four weigh 4^0.4 against 1.
         assert!((w[..4].iter().sum::<f32>() / w[4] - 4f32.powf(0.4)).abs() < 1e-5);
     }

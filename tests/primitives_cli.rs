@@ -83,7 +83,7 @@ fn a_folder_without_recordings_and_a_damaged_state_are_refused() {
         assert!(message.contains(expected), "{message}");
     };
     fails(&["train", "--data", "nowhere", "--out", "out"], "nowhere");
-    fails(&["eval", "--data", ".", "--model", "out"], "cmu_expmap");
+    fails(&["eval", "--data", ".", "--model", "out"], "nor two recordings");
     fails(&["train", "--data", ".", "--out", "out", "--klx", "1"], "--klx");
     fails(&["train", "--data", ".", "--out", "out", "--set", "loss.klx=1"], "klx");
     assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 0, "nothing is left behind");

@@ -3,7 +3,7 @@
 use super::FPS;
 use super::augment::{Kind, RECIPE, augment, hip_twists, mirror};
 use super::clip::{Clip, Skeleton, quantile, wrap};
-use super::cmu::{SourceClip, read_expmap};
+use super::cmu::read_expmap;
 use super::footlock::slides;
 use super::import::{ImportOptions, import};
 use super::primitive::MotionSet;
@@ -20,6 +20,11 @@ use std::path::{Path, PathBuf};
 const WALKS: [&str; 4] = ["test/walking", "test/walking_extra", "train/walking", "train/walking_extra"];
 /// BVH files that are used. 131 is a dance with stretched arms, 02_01 stands too high, 01_01 and 05_01 are no locomotion.
 const BVHS: [&str; 1] = ["16_11"];
+/// Folder of the exponential maps in the archives.
+const EXPMAPS: &str = "cmu_expmap";
+/// Of a folder of one's own, every eighth recording, from the second on, is held out; files of these kinds are recordings.
+const HELD_OUT_EVERY: usize = 8;
+const KINDS: [&str; 4] = ["bvh", "amc", "npz", "pkl"];
 /// Folder, beside `mocap/cmu_expmap`, of recordings of people who stand; they lend stops their upper bodies.
 const IDLE: &str = "reactidle_mit";
 /// Clips kept from training: seven straight walks and a turning one.
@@ -75,7 +80,10 @@ pub struct Clips {
     pub held_out: Vec<Clip>,
 }
 
-/// Reads the unpacked `mocap-cmu` and `mocap-idle` archives in `data_dir`, retargets them to `model`, augments them and makes markers.
+/// Reads the recordings in `data_dir`, retargets them to `model`, augments them and makes markers.
+///
+/// A folder with `mocap/cmu_expmap` is taken for the unpacked `mocap-cmu` and `mocap-idle` archives, of which the walks are used. Of any
+/// other folder all files that [`import`] knows are used, those of sub-folders included; each eighth by name is held out.
 ///
 /// Returns the training set, the held-out set (never augmented) and what was measured. `seed` fixes the augmentation.
 pub fn build(data_dir: impl AsRef<Path>, seed: u64, model: &BodyModel) -> Result<(MotionSet, MotionSet, BuildReport)> {
@@ -87,12 +95,16 @@ pub fn build(data_dir: impl AsRef<Path>, seed: u64, model: &BodyModel) -> Result
 
 /// [`build`] up to the clips.
 pub fn build_clips(data_dir: impl AsRef<Path>, seed: u64, skeleton: &Skeleton) -> Result<(Clips, BuildReport)> {
-    let sources = read_sources(data_dir.as_ref())?;
-    let mapped = sources.par_iter().map(|s| retarget(skeleton, s)).collect::<Result<Vec<_>>>()?;
-    let (clips, reports): (Vec<Clip>, Vec<RetargetReport>) = mapped.into_iter().unzip();
+    let data_dir = data_dir.as_ref();
+    let archives = root(data_dir).join(EXPMAPS).is_dir();
+    let read = if archives { read_archives(data_dir, skeleton)? } else { read_folder(data_dir, skeleton)? };
+    let (clips, reports): (Vec<Clip>, Vec<RetargetReport>) = read.into_iter().unzip();
     let mut report = retarget_report(&reports);
-    let (held_out, originals): (Vec<_>, Vec<_>) = clips.into_iter().partition(|c| HELD_OUT.contains(&c.name.as_str()));
-    let (variations, made) = augment(skeleton, &originals, &read_idle(data_dir.as_ref(), skeleton)?, seed);
+    let own: Vec<String> = clips.iter().skip(1).step_by(HELD_OUT_EVERY).map(|c| c.name.clone()).collect();
+    let kept = |c: &Clip| if archives { HELD_OUT.contains(&c.name.as_str()) } else { own.contains(&c.name) };
+    let (held_out, originals): (Vec<_>, Vec<_>) = clips.into_iter().partition(kept);
+    let idle = if archives { read_idle(data_dir, skeleton)? } else { Vec::new() };
+    let (variations, made) = augment(skeleton, &originals, &idle, seed);
     (report.made, report.kept) = (made, variations.len());
     report.sets.push(("held out".into(), SetStats::new(skeleton, &held_out.iter().collect::<Vec<_>>())));
     report.sets.push(("original".into(), SetStats::new(skeleton, &originals.iter().collect::<Vec<_>>())));
@@ -122,21 +134,42 @@ fn read_idle(data_dir: &Path, skeleton: &Skeleton) -> Result<Vec<Clip>> {
     files.par_iter().map(|(path, _)| Ok(import(path, &ImportOptions::default())?.put_on(skeleton)?.0)).collect()
 }
 
-fn read_sources(data_dir: &Path) -> Result<Vec<SourceClip>> {
+fn read_archives(data_dir: &Path, skeleton: &Skeleton) -> Result<Vec<(Clip, RetargetReport)>> {
     let root = root(data_dir);
-    if !root.join("cmu_expmap").is_dir() {
-        return Err(Error::file(data_dir, "holds no folder mocap/cmu_expmap: expected the unpacked mocap-cmu archive"));
-    }
     let mut clips = Vec::new();
     for set in WALKS {
-        for (path, stem) in sorted_files(&root.join("cmu_expmap").join(set), "txt")? {
+        for (path, stem) in sorted_files(&root.join(EXPMAPS).join(set), "txt")? {
             clips.push(read_expmap(path, &format!("{set}/{stem}"))?);
         }
     }
     for name in BVHS {
         clips.push(read_bvh(root.join("cmu_bvh").join(format!("{name}.bvh")), name)?);
     }
-    Ok(clips)
+    clips.par_iter().map(|s| retarget(skeleton, s)).collect()
+}
+
+/// Every recording below `dir`, named by its path there.
+fn read_folder(dir: &Path, skeleton: &Skeleton) -> Result<Vec<(Clip, RetargetReport)>> {
+    let mut files = Vec::new();
+    for entry in walkdir::WalkDir::new(dir).sort_by_file_name() {
+        let path = entry.map_err(|e| Error::file(dir, e.to_string()))?.into_path();
+        if path.extension().and_then(|e| e.to_str()).is_some_and(|e| KINDS.contains(&e.to_ascii_lowercase().as_str())) {
+            files.push(path);
+        }
+    }
+    if files.len() < 2 {
+        let what = format!(
+            "holds neither the unpacked mocap-cmu archive (a folder mocap/{EXPMAPS}) nor two recordings ({}), expected one or the other",
+            KINDS.join(", ")
+        );
+        return Err(Error::file(dir, what));
+    }
+    let clip = |path: &PathBuf| {
+        let (mut clip, report) = import(path, &ImportOptions::default())?.put_on(skeleton)?;
+        clip.name = path.strip_prefix(dir).unwrap_or(path).with_extension("").to_string_lossy().into_owned();
+        Ok((clip, report))
+    };
+    files.par_iter().map(clip).collect()
 }
 
 /// Files of `dir` with the extension, sorted by name, with their stems.
@@ -238,6 +271,25 @@ impl fmt::Display for BuildReport {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_folder_of_ones_own_is_read_by_kind() {
+        let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures");
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::create_dir(dir.path().join("b")).unwrap();
+        let copy = |from: &str, to: &str| std::fs::copy(fixtures.join(from), dir.path().join(to)).unwrap();
+        let skeleton = Skeleton::new(&BodyModel::embedded());
+        let refused = || build_clips(dir.path(), 0, &skeleton).err().unwrap().to_string();
+        assert!(refused().contains("holds neither the unpacked mocap-cmu archive"), "{}", refused());
+        copy("importers/smplx.npz", "b/walk.npz");
+        copy("motion/named.bvh", "a.bvh");
+        std::fs::write(dir.path().join("notes.md"), "no recording").unwrap();
+        let (clips, _) = build_clips(dir.path(), 0, &skeleton).unwrap();
+        assert_eq!(clips.held_out.iter().map(|c| c.name.as_str()).collect::<Vec<_>>(), ["b/walk"]);
+        assert_eq!(clips.train[0].name, "a");
+        std::fs::write(dir.path().join("c.npz"), "no archive").unwrap();
+        assert!(refused().contains("c.npz"), "{}", refused());
+    }
 
     /// The unpacked archive, from EGOGEN_MOCAP; the data is not part of the repository.
     #[test]

@@ -30,6 +30,52 @@ fn a_point_learns_to_reach_its_goal() {
     egogen::agent::bundle::Bundle::read(&out.join("policy")).expect("the bundle is whole");
 }
 
+/// Two seeds are the runs that each would be alone; the same command again does only what is missing.
+#[test]
+fn seeds_are_trained_once_and_tabulated() {
+    let dir = tempfile::tempdir().unwrap();
+    let [many, one] = ["many", "one"].map(|n| dir.path().join(n));
+    let small = ["--set", "run.epochs=1", "--set", "run.epoch_steps=4096", "--set", "adam.schedule=constant"];
+    let args = |rest: &[&'static str], out: &Path| {
+        [&["point"], rest, &small, &["--out"]]
+            .concat()
+            .into_iter()
+            .map(String::from)
+            .chain([out.to_str().unwrap().into()])
+            .collect::<Vec<_>>()
+    };
+    let run = |rest: &[&'static str], out: &Path| succeed(&args(rest, out).iter().map(String::as_str).collect::<Vec<_>>());
+    run(&["--seeds", "1", "--seed", "4"], &many);
+    let before = fs::metadata(many.join("seed-4/metrics.csv")).unwrap().modified().unwrap();
+    // As if the second run had been killed at once.
+    fs::create_dir_all(many.join("seed-5")).unwrap();
+    fs::copy(many.join("seed-4/recipe.toml"), many.join("seed-5/recipe.toml")).unwrap();
+    let noted = fs::read_to_string(many.join("seed-5/recipe.toml")).unwrap();
+    fs::write(many.join("seed-5/recipe.toml"), noted.replace("seed = 4", "seed = 5")).unwrap();
+    let told = run(&["--seeds", "2", "--seed", "4"], &many);
+    assert!(told.contains("seed-4: is finished") && told.contains("seed-5: goes on"), "{told}");
+    assert_eq!(fs::metadata(many.join("seed-4/metrics.csv")).unwrap().modified().unwrap(), before);
+    run(&["--seed", "5"], &one);
+    assert_same_run(&one, &many.join("seed-5"), "epoch-0001");
+
+    let last = |seed: &str| *column(&many.join(seed), "test_sto/return").last().unwrap();
+    let (a, b) = (last("seed-4"), last("seed-5"));
+    assert_ne!(a, b);
+    let table = fs::read_to_string(many.join("seeds.csv")).unwrap();
+    let line = table.lines().find(|l| l.starts_with("test_sto/return,")).unwrap();
+    let have: Vec<f64> = line.split(',').skip(1).map(|v| v.parse().unwrap()).collect();
+    // With two runs nothing is cut, and resamples are both of the first, both of the second, or one of each.
+    let mean = (a + b) / 2.0;
+    for (have, want) in have.iter().zip([mean, a.min(b), a.max(b), mean, a.min(b), a.max(b), 2.0]) {
+        assert!((have - want).abs() < 1e-3, "{line}: runs {a} and {b}");
+    }
+    let other = args(&["--seeds", "2", "--seed", "4", "--set", "ppo.gamma=0.5"], &many);
+    let output = train(&other.iter().map(String::as_str).collect::<Vec<_>>());
+    assert_eq!(output.status.code(), Some(2));
+    let told = stderr(&output);
+    assert!(["seed-4", "ppo.gamma", "0.95", "0.5"].iter().all(|w| told.contains(w)), "{told}");
+}
+
 #[test]
 fn bad_input_is_told_and_nothing_is_written() {
     let dir = tempfile::tempdir().unwrap();
@@ -80,10 +126,11 @@ fn looking_writes_nothing() {
     };
     let list = show(&["--list"]);
     assert!(["quick", "paper", "point"].iter().all(|n| list.contains(n)), "{list}");
-    let plan = show(&["point", "--dry-run", "--set", "ppo.clip=0.25"]);
+    let plan = show(&["point", "--dry-run", "--seeds", "3", "--set", "ppo.clip=0.25"]);
     // Trunk 64 over 4 floats; a block and an output layer each for 4 and for 1.
     let parameters = 64 * 5 + 2 * (2 * 64 * 65) + 65 * 4 + 65;
     assert!(plan.contains("clip = 0.25") && plan.contains(&format!("parameters: {parameters}")), "{plan}");
+    assert!(["# time: about", "minutes for 3 seeds"].iter().all(|w| plan.contains(w)), "{plan}");
     assert_eq!(fs::read_dir(&dir).unwrap().count(), 0);
 }
 

@@ -4,12 +4,15 @@ use crate::checkpoint::is_leftover;
 use crate::program::{self, Given, INTERRUPTED};
 use crate::recipe::{EMBEDDED, Plan, Recipe, of_run};
 use crate::registry::{Purpose, Registry};
-use crate::trainer::{Outcome, Trainer, initial, policy_spec};
+use crate::seeds::Seeds;
+use crate::start::{initial, policy_spec};
+use crate::trainer::{Outcome, Trainer};
 use crate::{Error, Result};
 use clap::Parser;
 use egogen::agent::ActionSpace;
 use egogen::agent::bundle::Bundle;
 use std::fs::DirEntry;
+use std::num::NonZeroU64;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -24,9 +27,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
   train                                   train the recipe `quick` into runs/quick
   train point --set run.epochs=4          a recipe with a changed value
   train my.toml --out runs/mine --seed 3  a recipe of your own
+  train cartpole --seeds 5                five seeds, and a table of their last tests
   train --resume runs/mine                continue bit for bit where it stopped
   train my.toml --init runs/mine/policy   start from the weights of a trained policy
-  train paper --dry-run                   show what would be done
+  train paper --dry-run                   show what would be done, and how long it would take
 
 Exit codes: 0 done, 1 failed while running, 2 bad usage or recipe, 130 interrupted (after saving)."
 )]
@@ -37,15 +41,19 @@ struct Args {
     /// List the embedded recipes
     #[arg(long)]
     list: bool,
-    /// Show the resolved recipe and its size, train nothing
+    /// Show the resolved recipe, its size and an estimate of time and memory; train nothing
     #[arg(long)]
     dry_run: bool,
-    /// Folder of the run; must be new or empty [default: runs/<name>, numbered when taken]
+    /// Folder of the run; must be new or empty [default: runs/<name>, numbered when taken; with --seeds runs/<name>-seeds]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Seed instead of the recipe's
     #[arg(long)]
     seed: Option<u64>,
+    /// Train this many seeds, counted up from the run's, one after another into <out>/seed-K, and tabulate their last tests in
+    /// <out>/seeds.csv; the same command again goes on where it stopped
+    #[arg(long, value_name = "N", conflicts_with_all = ["resume", "list"])]
+    seeds: Option<NonZeroU64>,
     /// Change a value of the recipe, e.g. ppo.clip=0.2; repeatable
     #[arg(long = "set", value_name = "KEY.PATH=VALUE")]
     set: Vec<String>,
@@ -89,7 +97,12 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
     let threads = start_threads(args.threads)?;
     let init = args.init.as_deref().map(Bundle::read).transpose().given()?;
     if args.dry_run {
-        return describe(&plan, registry, init.as_ref());
+        return describe(plan, registry, init.as_ref(), threads, args.seeds);
+    }
+    let stop = watch()?;
+    if let Some(count) = args.seeds {
+        let dir = args.out.clone().unwrap_or_else(|| Path::new("runs").join(format!("{}-seeds", plan.recipe.name)));
+        return Ok(code(Seeds { plan, registry, dir, threads, init }.run(count, &stop)?));
     }
     let mut trainer = match &args.resume {
         Some(dir) => Trainer::resume(plan, registry, dir, threads, |what| eprintln!("warning: {what}"))?,
@@ -99,6 +112,11 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
             Trainer::start(plan, registry, &dir, threads, init.as_ref())?
         }
     };
+    Ok(code(trainer.run(&stop)?))
+}
+
+/// What Ctrl-C sets.
+fn watch() -> Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = stop.clone();
     ctrlc::set_handler(move || {
@@ -108,11 +126,15 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
         }
     })
     .map_err(|e| Error::run(format!("cannot watch for Ctrl-C: {e}")))?;
-    match trainer.run(&stop)? {
-        Outcome::Finished => Ok(0),
+    Ok(stop)
+}
+
+fn code(outcome: Outcome) -> u8 {
+    match outcome {
+        Outcome::Finished => 0,
         Outcome::Interrupted => {
-            eprintln!("interrupted and saved; `--resume` continues");
-            Ok(INTERRUPTED)
+            eprintln!("interrupted and saved; `--resume` continues (with --seeds: the same command again)");
+            INTERRUPTED
         }
     }
 }
@@ -127,7 +149,7 @@ fn start_threads(wanted: Option<usize>) -> Result<usize> {
 }
 
 /// The given folder, which must be new or empty; or the first free one below `runs`.
-fn run_folder(given: Option<&Path>, name: &str) -> Result<PathBuf> {
+pub(crate) fn run_folder(given: Option<&Path>, name: &str) -> Result<PathBuf> {
     // A run that was killed at once leaves a folder in which nothing is whole.
     let whole = |entry: std::io::Result<DirEntry>| !entry.is_ok_and(|e| e.file_name().to_str().is_some_and(is_leftover));
     let free = |dir: &Path| std::fs::read_dir(dir).map_or(!dir.exists(), |mut entries| !entries.any(whole));
@@ -142,10 +164,10 @@ fn run_folder(given: Option<&Path>, name: &str) -> Result<PathBuf> {
     }
 }
 
-fn describe(plan: &Plan, registry: &Registry, init: Option<&Bundle>) -> Result<u8> {
+fn describe(plan: Plan, registry: &Registry, init: Option<&Bundle>, threads: usize, seeds: Option<NonZeroU64>) -> Result<u8> {
     let recipe = &plan.recipe;
     let made = registry.make(&recipe.env, &recipe.env_options, 1, Purpose::Test)?;
-    let spec = policy_spec(plan, made.env.spec())?;
+    let spec = policy_spec(&plan, made.env.spec())?;
     init.map(|bundle| initial(bundle, &spec, &made.origin)).transpose()?;
     let per_epoch = plan.updates_per_epoch * recipe.run.collect_steps as u64;
     println!("{}", recipe.to_toml()?);
@@ -157,5 +179,18 @@ fn describe(plan: &Plan, registry: &Registry, init: Option<&Bundle>) -> Result<u
     println!("# parameters: {}", spec.params());
     println!("# updates: {} per epoch, each from {} environments x {} steps", plan.updates_per_epoch, recipe.run.envs, plan.horizon);
     println!("# environment steps: {per_epoch} per epoch, {} in all", per_epoch * recipe.run.epochs);
+    let seconds = Trainer::estimate(plan, registry, threads)?;
+    let runs = seeds.map_or(String::new(), |n| format!(", {:.1} minutes for {n} seeds", seconds * n.get() as f64 / 60.0));
+    println!("# time: about {:.1} minutes on {threads} threads{runs}", seconds / 60.0);
+    if let Some(peak) = peak_memory() {
+        println!("# memory: about {peak}");
+    }
     Ok(0)
+}
+
+/// The most memory that this process has had so far, as Linux states it; `None` on other systems.
+fn peak_memory() -> Option<String> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let kib: f64 = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?.trim().strip_suffix(" kB")?.parse().ok()?;
+    Some(format!("{:.0} MiB", kib / 1024.0))
 }

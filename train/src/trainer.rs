@@ -1,20 +1,21 @@
 //! The run: collect, update, report, test, save; from the start or from a checkpoint.
 
-use crate::checkpoint::{self, Best, Checkpoint, DESCRIPTION, Description, RECIPE, STATE, State};
+use crate::checkpoint::{self, Best, Checkpoint, Description, State};
+use crate::clock::Clock;
 use crate::collector::{Collector, test_episodes};
 use crate::logger::{Console, Csv, Logger};
 use crate::policy::Compute;
 use crate::ppo::{Learner, Progress, Rules};
-use crate::recipe::{Plan, Recipe, difference};
+use crate::recipe::Plan;
 use crate::registry::{Purpose, Registry};
 use crate::shards::Shards;
+use crate::start::{INIT, Start, check_best, find, initial, policy_spec, seen};
 use crate::stats::{Episodes, EpochStats, Row};
 use crate::tensorboard::TensorBoard;
-use crate::{AdamW, Error, Result, Running};
+use crate::{AdamW, Error, Result};
 use egogen::agent::bundle::{Bundle, Trained};
-use egogen::agent::{ObsLayout, PolicySpec};
 use egogen::io::write_atomic;
-use egogen_envs::{ActionSpace, EnvSpec, VecEnv};
+use egogen_envs::{EnvSpec, VecEnv};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -29,8 +30,8 @@ pub enum Outcome {
     Interrupted,
 }
 
-/// Entry of a policy's origin: content hash of the weights that its training began with, where they came from a bundle.
-const INIT: &str = "init";
+/// Seconds of updates that an estimate measures.
+const MEASURED: f64 = 0.5;
 
 /// A run in its folder.
 pub struct Trainer {
@@ -49,27 +50,6 @@ pub struct Trainer {
     last_epoch: BTreeMap<String, f64>,
 }
 
-/// The policy that a plan trains in these environments.
-pub fn policy_spec(plan: &Plan, env: &EnvSpec) -> Result<PolicySpec> {
-    let ppo = &plan.recipe.ppo;
-    if matches!(env.action, ActionSpace::Discrete(_)) && ppo.kl_prior > 0.0 {
-        let (name, kl) = (&plan.recipe.name, ppo.kl_prior);
-        return Err(Error::config(format!(
-            "recipe '{name}': ppo.kl_prior is {kl}, expected 0: the actions are discrete and have no prior"
-        )));
-    }
-    PolicySpec::new(plan.recipe.policy.clone(), ObsLayout::new(env.obs.clone()), env.action)
-        .map_err(|e| Error::config(format!("recipe '{}': {e}", plan.recipe.name)))
-}
-
-/// What a run begins from.
-enum Start<'a> {
-    Seed,
-    Policy(&'a Bundle),
-    /// The run's newest checkpoint; the function hears of those that cannot be used.
-    Resume(&'a mut dyn FnMut(String)),
-}
-
 impl Trainer {
     /// Starts a run in the new folder `dir`; from the weights of the policy `init`, where one is given.
     pub fn start(plan: Plan, registry: &Registry, dir: &Path, threads: usize, init: Option<&Bundle>) -> Result<Self> {
@@ -82,6 +62,25 @@ impl Trainer {
     /// Continues the run in `dir` from its newest usable checkpoint, or from the start where it was killed before the first.
     pub fn resume(plan: Plan, registry: &Registry, dir: &Path, threads: usize, mut warn: impl FnMut(String)) -> Result<Self> {
         Self::build(plan, registry, dir, threads, Start::Resume(&mut warn))?.note_recipe()
+    }
+
+    /// Seconds that a whole run of this plan takes here, from some updates and one test of an untrained policy. Writes nothing.
+    pub fn estimate(plan: Plan, registry: &Registry, threads: usize) -> Result<f64> {
+        let run = plan.recipe.run;
+        let every = plan.recipe.test.every;
+        let (updates, tests) = (run.epochs * plan.updates_per_epoch, run.epochs.div_ceil(every));
+        let mut trainer = Self::build(plan, registry, Path::new(""), threads, Start::Seed)?;
+        // The first one also pays for memory and threads.
+        trainer.update(&mut Clock::default())?;
+        let (mut clock, mut done) = (Clock::default(), 0.0);
+        while done == 0.0 || clock.total() < MEASURED {
+            trainer.update(&mut clock)?;
+            done += 1.0;
+        }
+        let each = clock.total() / done;
+        let start = Instant::now();
+        trainer.test(true)?;
+        Ok(updates as f64 * each + tests as f64 * start.elapsed().as_secs_f64())
     }
 
     fn note_recipe(self) -> Result<Self> {
@@ -133,6 +132,16 @@ impl Trainer {
             last_epoch: state.last_epoch,
             plan,
         })
+    }
+
+    /// Content hashes of what the policy stands on and, where its training began with a policy's weights, of those.
+    pub fn origin(&self) -> &BTreeMap<String, String> {
+        &self.origin
+    }
+
+    /// Figures of the last whole epoch.
+    pub fn last_epoch(&self) -> &BTreeMap<String, f64> {
+        &self.last_epoch
     }
 
     /// Trains until all epochs are done or `stop` is set; saves either way. A finished run leaves `policy/` and `summary.json`.
@@ -212,19 +221,26 @@ impl Trainer {
         let test = &self.plan.recipe.test;
         let due = self.epoch.is_multiple_of(test.every) || self.epoch == self.plan.recipe.run.epochs;
         let start = Instant::now();
-        for (prefix, noise) in [("test_sto", true), ("test_det", false)] {
-            let mut episodes = Episodes::default();
-            if due {
-                episodes.add(&test_episodes(self.test_env.as_mut(), self.learner.policy(), test.seed, noise)?);
-            }
-            row.extend(episodes.row(prefix, &self.env_spec));
-        }
+        row.extend(self.test(due)?);
         clock.test = start.elapsed().as_secs_f64();
         if due {
             let tested = row.iter().filter(|(n, _)| n.starts_with("test_"));
             self.last_test = tested.filter_map(|(n, v)| v.map(|v| (n.clone(), v))).collect();
         }
         self.last_epoch = row.iter().filter_map(|(n, v)| v.map(|v| (n.clone(), v))).collect();
+        Ok(row)
+    }
+
+    /// Figures of test episodes with the policy's noise and without; `due`: play them, else their names alone.
+    fn test(&mut self, due: bool) -> Result<Row> {
+        let mut row = Row::new();
+        for (prefix, noise) in [("test_sto", true), ("test_det", false)] {
+            let mut episodes = Episodes::default();
+            if due {
+                episodes.add(&test_episodes(self.test_env.as_mut(), self.learner.policy(), self.plan.recipe.test.seed, noise)?);
+            }
+            row.extend(episodes.row(prefix, &self.env_spec));
+        }
         Ok(row)
     }
 
@@ -290,6 +306,7 @@ impl Trainer {
             "parameters": self.learner.params().len(),
             "policy": chosen,
             "best": self.best,
+            "origin": self.origin,
             "last_epoch": self.last_epoch,
         });
         let text = serde_json::to_string_pretty(&summary).map_err(|e| Error::run(format!("cannot write the summary: {e}")))?;
@@ -302,117 +319,4 @@ pub fn export(from: &Path, to: &Path) -> Result<()> {
     let (d, spec, params) = Checkpoint::read_policy(from)?;
     let trained = Trained { recipe: d.recipe, seed: d.seed, epoch: d.epoch, env_steps: d.env_steps, test: d.test };
     Ok(Bundle::new(spec, &params, d.origin, trained)?.write(to)?)
-}
-
-/// What a bundle knows of observations, as if counted here.
-fn seen(bundle: &Bundle) -> Vec<Running> {
-    let norm = &bundle.params[bundle.spec.obs_norm_range()];
-    let (mean, std) = norm.split_at(norm.len() / 2);
-    let count = bundle.trained.env_steps as f64;
-    let one = |(&m, &s): (&f32, &f32)| Running { mean: f64::from(m), variance: f64::from(s).powi(2), count };
-    mean.iter().zip(std).map(one).collect()
-}
-
-/// The weights of `bundle` for a policy of these sizes that stands on `origin`.
-pub(crate) fn initial(bundle: &Bundle, spec: &PolicySpec, origin: &BTreeMap<String, String>) -> Result<Vec<f32>> {
-    let bad = |e: egogen::Error| Error::config(format!("--init: {e}"));
-    let params = bundle.weights_for(spec).map_err(bad)?;
-    origin.iter().try_for_each(|(what, hash)| bundle.require(what, hash)).map_err(bad)?;
-    Ok(params)
-}
-
-/// The checkpoint that the run in `dir` continues from, loaded into `collector`; clears up what a kill left half done.
-fn find(
-    dir: &Path,
-    recipe: &Recipe,
-    spec: &PolicySpec,
-    origin: &BTreeMap<String, String>,
-    collector: &mut Collector,
-    warn: &mut dyn FnMut(String),
-) -> Result<Option<Checkpoint>> {
-    let root = dir.join("checkpoints");
-    let accept = |c: &Checkpoint| {
-        let folder = root.join(c.name());
-        check_same(c, &folder, recipe, spec, origin)?;
-        collector.load(&c.state.collector).map_err(|e| egogen::Error::file(folder.join(STATE), e.to_string()).into())
-    };
-    let mut from = checkpoint::newest(&root, accept, &mut *warn)?;
-    match &mut from {
-        None => {
-            let reported = Csv::epochs(&dir.join("metrics.csv"))?;
-            if reported > recipe.checkpoint.every {
-                let what = format!("holds no checkpoint, though metrics.csv reports {reported} epochs; nothing to continue from");
-                return Err(Error::config(format!("{}: {what}", root.display())));
-            }
-            warn(format!("{}: holds no checkpoint yet; the run starts from the beginning", root.display()));
-        }
-        Some(c) => {
-            let lost = c.state.best.take_if(|b| Checkpoint::read(&root.join(&b.name)).is_err());
-            lost.inspect(|b| {
-                warn(format!("{}: the best checkpoint so far is lost; only later ones can be the best", root.join(&b.name).display()))
-            });
-        }
-    }
-    [dir, &root, &dir.join("policy")].into_iter().try_for_each(checkpoint::sweep)?;
-    Ok(from)
-}
-
-/// A run goes on only with what it began with.
-fn check_same(c: &Checkpoint, folder: &Path, recipe: &Recipe, spec: &PolicySpec, origin: &BTreeMap<String, String>) -> Result<()> {
-    let bad = |file: &str, what: String| Err(egogen::Error::file(folder.join(file), what).into());
-    if let Some(text) = &c.recipe {
-        let theirs = Recipe::parse(&folder.join(RECIPE).display().to_string(), text, &[])?;
-        if let Some((key, [was, is])) = difference(&theirs, recipe)? {
-            return bad(RECIPE, format!("is of another run: {key} is {was}, expected {is}"));
-        }
-    }
-    let d = &c.description;
-    if (&d.recipe, d.seed) != (&recipe.name, recipe.seed) {
-        let what = format!("is of another run: '{}' with seed {}, expected '{}' with seed {}", d.recipe, d.seed, recipe.name, recipe.seed);
-        return bad(DESCRIPTION, what);
-    }
-    if d.layout != spec.layout || d.policy != spec.config || d.action != spec.action {
-        return bad(DESCRIPTION, "holds a policy of other sizes than the recipe and its environment ask for".into());
-    }
-    match origin.iter().find(|(name, hash)| d.origin.get(*name) != Some(hash)) {
-        Some((name, hash)) => {
-            let was = d.origin.get(name).map_or("nothing", String::as_str);
-            bad(DESCRIPTION, format!("was trained on {name} {was}, but {name} {hash} is here now"))
-        }
-        None => Ok(()),
-    }
-}
-
-/// The figure that chooses checkpoints must be one that is reported.
-fn check_best(best: &str, env: &EnvSpec) -> Result<()> {
-    let rows = [EpochStats::default().row(env), Episodes::default().row("test_sto", env), Episodes::default().row("test_det", env)];
-    let names: Vec<String> = rows.into_iter().flatten().map(|(name, _)| name).collect();
-    if names.iter().any(|n| n == best) {
-        return Ok(());
-    }
-    Err(Error::config(format!("checkpoint.best is '{best}', expected one of: {}", names.join(", "))))
-}
-
-/// Wall-clock seconds of an epoch.
-#[derive(Default)]
-struct Clock {
-    collect: f64,
-    learn: f64,
-    test: f64,
-}
-
-impl Clock {
-    fn total(&self) -> f64 {
-        self.collect + self.learn + self.test
-    }
-
-    fn row(&self, steps: u64) -> Row {
-        let figures = [
-            ("steps_per_second", steps as f64 / self.total()),
-            ("collect_seconds", self.collect),
-            ("learn_seconds", self.learn),
-            ("test_seconds", self.test),
-        ];
-        figures.into_iter().map(|(n, v)| (n.to_string(), Some(v))).collect()
-    }
 }

@@ -4,7 +4,7 @@ use crate::{Error, Result};
 use egogen::sim::World;
 use egogen_envs::VecEnv;
 use egogen_envs::control::{Acrobot, CartPole, Control, Dynamics, MountainCar, MountainCarContinuous, Pendulum};
-use egogen_envs::motion::{MotionEnv, MotionTask};
+use egogen_envs::motion::{MotionEnv, MotionTask, Outcome, OwnTerm};
 use egogen_envs::point::PointGoal;
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -30,6 +30,9 @@ pub enum Purpose {
 /// Makes that many environments from a recipe's `[env_options]`; refuses options it does not know.
 pub type Factory = Box<dyn Fn(&toml::Table, usize, Purpose) -> Result<Made> + Send + Sync>;
 
+/// A reward term of one's own: its name, and its value before weighting.
+pub type OwnReward = (&'static str, fn(&Outcome) -> f32);
+
 /// The environments a program knows.
 #[derive(Default)]
 pub struct Registry {
@@ -40,7 +43,7 @@ impl Registry {
     /// The environments of this project.
     pub fn standard() -> Self {
         let mut registry = Self::default();
-        registry.add("motion", motion);
+        registry.add_motion("motion", &[]);
         registry.add_plain("point", |n| Box::new(PointGoal::new(n, 0)));
         registry.add_control::<CartPole>("cartpole");
         registry.add_control::<Acrobot>("acrobot");
@@ -48,6 +51,12 @@ impl Registry {
         registry.add_control::<MountainCar>("mountaincar");
         registry.add_control::<MountainCarContinuous>("mountaincar_continuous");
         registry
+    }
+
+    /// Adds (or replaces) the motion task with reward terms of one's own: names, and functions of a step's outcome. A recipe weighs
+    /// them in `[env_options.terms]`; those that it does not name weigh nothing.
+    pub fn add_motion(&mut self, name: &str, own: &'static [OwnReward]) {
+        self.add(name, move |options, n, purpose| motion(options, own, n, purpose));
     }
 
     /// Adds an environment without options that stands on nothing.
@@ -89,13 +98,21 @@ struct MotionOptions {
     motion: Option<PathBuf>,
     /// The task.
     task: MotionTask,
+    /// Weights of reward terms that a program adds.
+    terms: BTreeMap<String, f32>,
 }
 
 /// People that walk to a goal round a box. Tests begin from seed motions that training does not see.
-fn motion(options: &toml::Table, n: usize, purpose: Purpose) -> Result<Made> {
+fn motion(options: &toml::Table, own: &[OwnReward], n: usize, purpose: Purpose) -> Result<Made> {
     let bad = |e: toml::de::Error| Error::config(format!("env_options: {}", e.to_string().trim_end()));
     let options: MotionOptions = options.clone().try_into().map_err(bad)?;
     options.task.validate().map_err(|e| Error::config(format!("env_options.task.{e}")))?;
+    let known: Vec<&str> = own.iter().map(|(name, _)| *name).collect();
+    if let Some((name, weight)) = options.terms.iter().find(|(name, w)| !known.contains(&name.as_str()) || !w.is_finite()) {
+        return Err(Error::config(format!("env_options.terms.{name} is {weight}, expected a finite weight of one of {known:?}")));
+    }
+    let weight = |name: &str| options.terms.get(name).copied().unwrap_or(0.0);
+    let own = own.iter().map(|&(name, value)| OwnTerm { name: name.into(), value, weight: weight(name) }).collect();
     let world = match &options.motion {
         Some(dir) => World::load(dir).map_err(|e| Error::config(format!("env_options.motion: {e}")))?,
         None => World::embedded()?,
@@ -106,7 +123,7 @@ fn motion(options: &toml::Table, n: usize, purpose: Purpose) -> Result<Made> {
         Purpose::Test => MotionEnv::evaluation(options.task, sim, world.held_out, n, 0),
     };
     let env = env.map_err(|e| Error::config(format!("env_options: {e}")))?;
-    Ok(Made { env: Box::new(env), origin })
+    Ok(Made { env: Box::new(env.with_terms(own)), origin })
 }
 
 #[cfg(test)]

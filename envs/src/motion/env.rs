@@ -1,7 +1,7 @@
 //! The vectorised environment of the motion task.
 
 use super::member::{Member, OBS, STATE, Step, blocked};
-use super::{EPISODE, MotionTask, TERMS};
+use super::{EPISODE, MotionTask, OwnTerm, TERMS};
 use crate::{ActionSpace, EnvError, EnvSpec, ObsGroup, StepResult, VecEnv};
 use egogen::body::PARAMS;
 use egogen::motion::{FRAMES, PosePrior, SEED};
@@ -35,6 +35,7 @@ pub enum Starts {
 pub struct MotionEnv {
     spec: EnvSpec,
     task: MotionTask,
+    own: Vec<OwnTerm>,
     starts: Starts,
     sim: Arc<Sim>,
     bank: Arc<SeedBank>,
@@ -101,9 +102,16 @@ impl MotionEnv {
         let spec = spec(sim.model().latent_dim());
         let state = State { seed, people: People::new(n), members: vec![Member::default(); n] };
         let judge = PoseJudge::new(&task)?;
-        let mut env = Self { spec, task, starts, sim, bank, judge, state, prims: Primitives::default() };
+        let mut env = Self { spec, task, own: Vec::new(), starts, sim, bank, judge, state, prims: Primitives::default() };
         env.restart(seed)?;
         Ok(env)
+    }
+
+    /// Adds terms of one's own to the reward and to the figures of a step.
+    pub fn with_terms(mut self, own: Vec<OwnTerm>) -> Self {
+        self.spec.info.extend(own.iter().map(|term| term.name.clone()));
+        self.own.extend(own);
+        self
     }
 
     /// The simulation that moves everyone.
@@ -182,8 +190,9 @@ impl MotionEnv {
     /// Judges everyone after a step; returns who ended.
     fn judge(&mut self, out: &mut StepResult) -> Result<Vec<usize>, EnvError> {
         let State { people, members, .. } = &mut self.state;
-        let (task, prims, people, judge) = (&self.task, &self.prims, &*people, &self.judge);
-        let (terms, figures) = (out.info.par_chunks_exact_mut(TERMS.len()), out.episode.par_chunks_exact_mut(EPISODE.len()));
+        let (task, prims, people, judge) = ((&self.task, self.own.as_slice()), &self.prims, &*people, &self.judge);
+        let names = &self.spec.info;
+        let (terms, figures) = (out.info.par_chunks_exact_mut(names.len()), out.episode.par_chunks_exact_mut(EPISODE.len()));
         let each = (members, terms, figures, &mut out.reward, &mut out.terminated).into_par_iter().with_min_len(CHUNK);
         each.enumerate().for_each(|(i, (member, terms, episode, reward, ended))| {
             let natural = judge.as_ref().is_none_or(|j| j.natural(prims, i));
@@ -191,8 +200,8 @@ impl MotionEnv {
             (*reward, *ended) = (verdict.reward, verdict.ended);
         });
         if let Some(i) = out.reward.iter().position(|r| !r.is_finite()) {
-            let k = out.info[i * TERMS.len()..].iter().position(|t| !t.is_finite()).unwrap_or(0);
-            let what = format!("reward term '{}' of environment {i} is {}", TERMS[k].name, out.info[i * TERMS.len() + k]);
+            let k = out.info[i * names.len()..].iter().position(|t| !t.is_finite()).unwrap_or(0);
+            let what = format!("reward term '{}' of environment {i} is {}", names[k], out.info[i * names.len() + k]);
             return Err(EnvError::Invalid(format!("{what}: the motion model left all bounds")));
         }
         Ok((0..out.terminated.len()).filter(|&i| out.terminated[i]).collect())

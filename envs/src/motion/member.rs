@@ -1,6 +1,6 @@
 //! One person on its task: what it sees, what a step earned it, how its episode went.
 
-use super::rewards::{Outcome, TERMS};
+use super::rewards::{Outcome, OwnTerm, TERMS};
 use super::{EPISODE, MotionTask};
 use egogen::body::{JOINTS, MARKER_DIM, canonical_frame, joint};
 use egogen::motion::{FRAMES, SEED};
@@ -80,7 +80,7 @@ impl Member {
     /// Judges the step just made; writes the weighted reward terms and, at an end, the episode's figures.
     pub fn judge(
         &mut self,
-        task: &MotionTask,
+        (task, own): (&MotionTask, &[OwnTerm]),
         &Step { people, prims, person: i, natural }: &Step,
         terms: &mut [f32],
         episode: &mut [f32],
@@ -106,6 +106,9 @@ impl Member {
         };
         for (out, term) in terms.iter_mut().zip(&TERMS) {
             *out = (term.weight)(&task.weights) * (term.value)(&outcome);
+        }
+        for (out, term) in terms[TERMS.len()..].iter_mut().zip(own) {
+            *out = term.weight * (term.value)(&outcome);
         }
         let reward = terms.iter().sum();
         self.dist = dist;

@@ -12,7 +12,7 @@ mod toy;
 pub use config::{MotionTask, PoseCheck, Weights};
 pub use env::{MotionEnv, Starts};
 pub use member::blocked;
-pub use rewards::{Outcome, TERMS, Term};
+pub use rewards::{Outcome, OwnTerm, TERMS, Term};
 
 /// Figures of an episode: whether it arrived cleanly, whether it ended by penetration, its steps, the sum of its rewards,
 /// the final 3-D distance from pelvis to goal, the smallest one in the plane at any frame (metres), whether more than 2

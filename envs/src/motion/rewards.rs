@@ -41,7 +41,18 @@ pub struct Term {
     pub weight: fn(&Weights) -> f32,
 }
 
-/// All terms; the reward of a step is their weighted sum.
+/// A term that other crates add to [`TERMS`].
+#[derive(Clone, Debug)]
+pub struct OwnTerm {
+    /// Its name in the figures of a step.
+    pub name: String,
+    /// Its value before weighting.
+    pub value: fn(&Outcome) -> f32,
+    /// Its weight.
+    pub weight: f32,
+}
+
+/// All terms of the task itself; the reward of a step is their weighted sum.
 pub const TERMS: [Term; 9] = [
     Term { name: "floor", value: floor, weight: |w| w.floor },
     Term { name: "skate", value: skate, weight: |w| w.skate },

@@ -29,6 +29,7 @@ const CARTPOLE: &[&str] = &["cartpole", "run.epoch_steps=512", "ppo.passes=4", "
 const STATE: &[&str] = &[
     "adam.schedule={ adaptive = { target_kl = 0.02 } }",
     "ppo.reward_normalization=true",
+    "ppo.reward_scaling=true",
     "policy.obs_norm=true",
     "ppo.recompute_advantage=true",
     "ppo.value_clip=true",
@@ -91,8 +92,9 @@ fn a_resumed_run_and_another_thread_count_give_the_same_bytes() {
 #[test]
 fn a_killed_run_resumes_with_everything_that_has_state() {
     let dir = tempfile::tempdir().unwrap();
-    for (recipe, rate) in [(POINT, 1e-3), (CARTPOLE, 1e-3)] {
-        let recipe = [recipe, STATE, &["run.epochs=12"]].concat();
+    let held: &[&str] = &["policy.state_noise={ log_std = -1.0, steps = 3 }"];
+    for (recipe, rate, own) in [(POINT, 1e-3, held), (CARTPOLE, 1e-3, &[])] {
+        let recipe = [recipe, STATE, own, &["run.epochs=12"]].concat();
         let whole = dir.path().join(recipe[0]);
         succeed(&args(&recipe, &whole));
         let rates = column(&whole, "loss/learning_rate");
@@ -233,8 +235,8 @@ fn spoiled_checkpoints_are_refused_for_the_one_before() {
         (Box::new(folder(&gamma, "epoch-0003")), ["recipe.toml", "ppo.gamma is 0.9, expected 0.95"]),
         (Box::new(folder(&cartpole, "epoch-0003")), ["recipe.toml", "env is \"cartpole\", expected \"point\""]),
         (Box::new(folder(&wide, "epoch-0003")), ["recipe.toml", "policy.trunk is 24, expected 16"]),
-        (Box::new(edit("\"format\": 3", "\"format\": 4, \"more\": 1")), ["checkpoint.json", "format is 4, from a newer version"]),
-        (Box::new(edit("\"format\": 3", "\"format\": 1")), ["checkpoint.json", "format is 1, which can no longer be read"]),
+        (Box::new(edit("\"format\": 4", "\"format\": 5, \"more\": 1")), ["checkpoint.json", "format is 5, from a newer version"]),
+        (Box::new(edit("\"format\": 4", "\"format\": 1")), ["checkpoint.json", "format is 1, which can no longer be read"]),
         (Box::new(edit("\"epoch\": 3", "\"epoch\": 2")), ["checkpoint.json", "is of epoch 2, but state.bin is of epoch 3"]),
     ];
     for (i, (spoil, words)) in cases.iter().enumerate() {
@@ -247,6 +249,25 @@ fn spoiled_checkpoints_are_refused_for_the_one_before() {
         assert!(hurt.join("checkpoints/refused-epoch-0003").is_dir(), "{words:?}");
         assert_same_run(&whole, &hurt, "epoch-0004");
     }
+}
+
+/// Format 3 ends before the scale of rewards: an empty list and three floats.
+#[test]
+fn checkpoints_of_the_format_before_are_continued() {
+    let dir = tempfile::tempdir().unwrap();
+    let whole = run(dir.path(), "whole", POINT, 2);
+    let parts = run(dir.path(), "parts", POINT, 1);
+    let checkpoint = parts.join("checkpoints/epoch-0001");
+    let mut state = read(&checkpoint, "state.bin");
+    let new = egogen::io::content_hash(&state);
+    state.truncate(state.len() - 25);
+    fs::write(checkpoint.join("state.bin"), &state).unwrap();
+    let description = String::from_utf8(read(&checkpoint, "checkpoint.json")).unwrap();
+    assert!(description.contains(&new));
+    let older = description.replace(&new, &egogen::io::content_hash(&state)).replace("\"format\": 4", "\"format\": 3");
+    fs::write(checkpoint.join("checkpoint.json"), older).unwrap();
+    succeed(&["--resume", text(&parts), "--set", "run.epochs=2"]);
+    assert_same_run(&whole, &parts, "epoch-0002");
 }
 
 #[test]

@@ -176,8 +176,10 @@ impl Bundle {
         let engine = PolicyEngine::new(&self.spec, &self.params)?;
         let mut out = vec![0.0; engine.output_dim()];
         engine.forward(&obs, &mut out)?;
-        let value = out.pop().unwrap_or_default();
-        let logvar = out.split_off(self.spec.action.count());
+        let mut rest = out.split_off(self.spec.action.count());
+        let value = rest[engine.value_at() - out.len()];
+        rest.truncate(engine.value_at() - out.len());
+        let logvar = rest;
         Ok(Golden { obs, mu: out, logvar, value })
     }
 

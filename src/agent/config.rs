@@ -73,6 +73,17 @@ pub enum Nonlinearity {
     Relu,
 }
 
+/// Noise that depends on the state (gSDE, Raffin et al. 2021): actions are mean + h E, h the actor's last hidden activations and E
+/// normal with standard deviations of its own, which are learned; their gradients do not move h.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StateNoise {
+    /// Where the log standard deviations of E start.
+    pub log_std: f32,
+    /// Steps for which each environment keeps its E.
+    pub steps: u64,
+}
+
 /// Sizes of the policy network, as a recipe gives them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -101,6 +112,9 @@ pub struct PolicyConfig {
     /// Start of a log standard deviation of actions that is a parameter of its own; absent: the network gives the log variance.
     #[serde(default)]
     pub log_std: Option<f32>,
+    /// Noise that depends on the state, in place of one that is drawn anew for every step; absent: none.
+    #[serde(default)]
+    pub state_noise: Option<StateNoise>,
     /// Observations are brought to mean 0 and standard deviation 1, as far as training has seen them, and cut to +-10.
     #[serde(default)]
     pub obs_norm: bool,
@@ -165,6 +179,14 @@ fn check_heads(config: &PolicyConfig, action: ActionSpace) -> Result<()> {
     }
     if config.shared && config.hidden.is_empty() {
         return bad("policy.shared is true, but policy.hidden names no layers to share".into());
+    }
+    if let Some(noise) = config.state_noise {
+        if matches!(action, ActionSpace::Discrete(_)) || config.log_std.is_some() {
+            return bad("policy.state_noise is set, expected continuous actions and no policy.log_std".into());
+        }
+        if noise.steps == 0 || !noise.log_std.is_finite() {
+            return bad(format!("policy.state_noise is {noise:?}, expected a finite log_std and steps above 0"));
+        }
     }
     match (config.log_std, action) {
         (Some(_), ActionSpace::Discrete(_)) => bad("policy.log_std is set, but the actions are discrete".into()),

@@ -16,6 +16,19 @@ pub fn log_prob_of(mu: &[f32], logvar: &[f32], action: &[f32]) -> f32 {
     -0.5 * terms.sum::<f32>()
 }
 
+/// Added to variances that depend on the state, as Stable-Baselines3 does.
+pub const NOISE_EPS: f32 = 1e-6;
+
+/// Log variances of actions whose noise is h E: ln(sum_j h_j^2 v_jk + 1e-6), with `variances` v (L, A) of the entries of E and the
+/// activations `latent` h (L).
+pub fn state_logvar(latent: &[f32], variances: &[f32], out: &mut [f32]) {
+    out.fill(NOISE_EPS);
+    for (h, row) in latent.iter().zip(variances.chunks_exact(out.len())) {
+        out.iter_mut().zip(row).for_each(|(o, v)| *o += h * h * v);
+    }
+    out.iter_mut().for_each(|o| *o = o.ln());
+}
+
 /// Entropy of the whole action, summed over dimensions: (n, A) to (n).
 pub fn entropy(logvar: Tensor<2>) -> Tensor<1> {
     let [_, dims] = logvar.dims();

@@ -28,7 +28,8 @@ impl PolicySpec {
                 None => orthogonal(layer, std::f32::consts::SQRT_2 * self.scale(i), &mut rng, block),
             }
         }
-        flat[self.log_std_range()].fill(self.config.log_std.unwrap_or(0.0));
+        let log_std = self.config.state_noise.map(|noise| noise.log_std).or(self.config.log_std);
+        flat[self.log_std_range()].fill(log_std.unwrap_or(0.0));
         let std = self.obs_norm_range().skip(self.layout.dim());
         std.for_each(|i| flat[i] = 1.0);
         flat

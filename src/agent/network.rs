@@ -3,7 +3,7 @@
 //! Parameters live in one flat vector outside (see [`PolicySpec`]): the optimiser, the gradient norm and files work on that, and a
 //! [`Network`] is built from it for each update.
 
-use super::{ActionSpace, Dense, Nonlinearity, Part, PolicySpec};
+use super::{ActionSpace, Dense, NOISE_EPS, Nonlinearity, Part, PolicySpec};
 use burn::tensor::activation::{relu, sigmoid, tanh};
 use burn::tensor::module::linear;
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
@@ -19,6 +19,8 @@ pub struct Output {
     pub logvar: Option<Tensor<2>>,
     /// (n) value.
     pub value: Tensor<1>,
+    /// (n, L) the actor's last hidden activations.
+    pub latent: Tensor<2>,
 }
 
 struct Layer {
@@ -30,7 +32,7 @@ struct Layer {
 pub struct Network {
     spec: PolicySpec,
     layers: Vec<Layer>,
-    /// (1, A)
+    /// (1, A), or (L, A) where noise depends on the state.
     log_std: Option<Tensor<2>>,
     /// Means and standard deviations of observations.
     obs_norm: Vec<f32>,
@@ -49,7 +51,15 @@ impl Network {
             weight: Tensor::from_data(TensorData::new(d.weight_of(flat).to_vec(), [d.output, d.input]), &inner),
             bias: Tensor::from_data(TensorData::new(d.bias_of(flat).to_vec(), [d.output]), &inner),
         };
-        let log_std = || Tensor::from_data(TensorData::new(flat[spec.log_std_range()].to_vec(), [1, spec.action.count()]), &inner);
+        let log_std = || {
+            Tensor::from_data(
+                TensorData::new(
+                    flat[spec.log_std_range()].to_vec(),
+                    [spec.log_std_range().len() / spec.action.count(), spec.action.count()],
+                ),
+                &inner,
+            )
+        };
         let (log_std, obs_norm) = (spec.log_std.map(|_| log_std()), flat[spec.obs_norm_range()].to_vec());
         let network = Self { spec: spec.clone(), layers: spec.layers.iter().map(layer).collect(), log_std, obs_norm, device: inner };
         if device.is_autodiff() { network.with_gradients() } else { network }
@@ -80,24 +90,28 @@ impl Network {
     /// Actions and values for observation rows (n x layout.dim()).
     pub fn forward(&self, obs: &[f32]) -> Output {
         let trunk = self.trunk(obs);
-        let out = self.head(&self.spec.actor, trunk.clone());
-        let value = self.head(&self.spec.critic, trunk).squeeze_dim(1);
+        let (latent, out) = self.head(&self.spec.actor, trunk.clone());
+        let value = self.head(&self.spec.critic, trunk).1.squeeze_dim(1);
         let [low, high] = self.spec.config.logvar;
-        let ActionSpace::Continuous(width) = self.spec.action else { return Output { mu: out, logvar: None, value } };
+        let ActionSpace::Continuous(width) = self.spec.action else { return Output { mu: out, logvar: None, value, latent } };
         let (mu, logvar) = match &self.log_std {
+            Some(log_std) if self.spec.config.state_noise.is_some() => {
+                let variance = latent.clone().detach().powf_scalar(2.0).matmul((log_std.clone() * 2.0).exp());
+                return Output { mu: out, logvar: Some((variance + NOISE_EPS).log()), value, latent };
+            }
             Some(log_std) => {
                 let rows = out.dims()[0];
                 (out, log_std.clone().repeat_dim(0, rows) * 2.0)
             }
             None => (out.clone().narrow(1, 0, width), out.narrow(1, width, width)),
         };
-        Output { mu, logvar: Some(logvar.clamp(low, high)), value }
+        Output { mu, logvar: Some(logvar.clamp(low, high)), value, latent }
     }
 
     /// Values only, (n).
     pub fn value(&self, obs: &[f32]) -> Tensor<1> {
         let trunk = self.trunk(obs);
-        self.head(&self.spec.critic, trunk).squeeze_dim(1)
+        self.head(&self.spec.critic, trunk).1.squeeze_dim(1)
     }
 
     /// Adds the gradients of all parameters to `flat`, in its layout; parameters without one add nothing.
@@ -189,16 +203,18 @@ impl Network {
         state.unwrap_or_else(|| Tensor::zeros([rows, hidden], &self.device))
     }
 
-    fn head(&self, layers: &[usize], mut h: Tensor<2>) -> Tensor<2> {
+    /// Last hidden activations and output.
+    fn head(&self, layers: &[usize], mut h: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
         let (output, blocks) = layers.split_last().expect("a head has an output layer");
         if !self.spec.config.hidden.is_empty() {
-            return self.apply(*output, self.plain(blocks, h));
+            h = self.plain(blocks, h);
+            return (h.clone(), self.apply(*output, h));
         }
         for block in blocks.chunks_exact(2) {
             let inner = leaky(self.apply(block[0], h.clone()));
             h = leaky(self.apply(block[1], inner)) + h;
         }
-        self.apply(*output, h)
+        (h.clone(), self.apply(*output, h))
     }
 
     fn apply(&self, layer: usize, x: Tensor<2>) -> Tensor<2> {

@@ -9,10 +9,11 @@
 //! | `actor.<b>.<0 or 1>.weight`, `.bias` | (W, W), (W) | h = block(h) + h, block = two leaky ReLU layers |
 //! | `actor.<i>.weight`, `.bias` | (W', W), (W') | plain layers instead, with [`PolicyConfig::hidden`] |
 //! | `actor.out.weight`, `.bias` | (2A, W), (2A) | mean, then log variance before the clamp |
-//! | | (A, W), (A) | the mean alone, with [`PolicyConfig::log_std`] |
+//! | | (A, W), (A) | the mean alone, with [`PolicyConfig::log_std`] or [`PolicyConfig::state_noise`] |
 //! | | (K, W), (K) | logits of K discrete actions |
 //! | `critic.<b>.<0 or 1>` or `critic.<i>`, `critic.out` | (W, W), (1, W) | |
 //! | `actor.log_std` | (A) | log standard deviation before the clamp, with [`PolicyConfig::log_std`] |
+//! | | (W, A) | of the entries of E, with [`PolicyConfig::state_noise`] |
 //! | `obs.mean`, `obs.std` | (D), (D) | of all observations seen, with [`PolicyConfig::obs_norm`]; not learned by gradients |
 //!
 //! Layouts are torch's: `weight` is (out, in) row-major, y = W x + b.
@@ -102,7 +103,7 @@ pub struct PolicySpec {
     pub actor: Vec<usize>,
     /// Indices of the critic's layers.
     pub critic: Vec<usize>,
-    /// First float of the log standard deviation that is a parameter.
+    /// First float of the log standard deviations that are parameters.
     pub log_std: Option<usize>,
     /// First float of the observations' means and standard deviations, which lie behind all that is learned.
     pub obs_norm: Option<usize>,
@@ -132,7 +133,7 @@ impl PolicySpec {
         }
         spec.actor = spec.head("actor", trunk, spec.outputs());
         spec.critic = spec.head("critic", trunk, 1);
-        spec.log_std = spec.config.log_std.map(|_| spec.params());
+        spec.log_std = (spec.config.log_std.is_some() || spec.config.state_noise.is_some()).then(|| spec.params());
         spec.obs_norm = spec.config.obs_norm.then(|| spec.params());
         Ok(spec)
     }
@@ -140,14 +141,30 @@ impl PolicySpec {
     /// Floats the actor gives: means and log variances, means alone, or logits.
     pub fn outputs(&self) -> usize {
         match self.action {
-            ActionSpace::Continuous(n) if self.config.log_std.is_none() => 2 * n,
+            ActionSpace::Continuous(n) if self.config.log_std.is_none() && self.config.state_noise.is_none() => 2 * n,
             _ => self.action.count(),
         }
     }
 
     /// Where [`PolicySpec::log_std`] lies; empty where there is none.
     pub fn log_std_range(&self) -> std::ops::Range<usize> {
-        self.log_std.map_or(0..0, |at| at..at + self.action.count())
+        self.log_std.map_or(0..0, |at| at..at + self.log_std_shape().iter().product::<usize>())
+    }
+
+    fn log_std_shape(&self) -> Vec<usize> {
+        let latent = self.config.state_noise.map(|_| self.latent());
+        latent.into_iter().chain([self.action.count()]).collect()
+    }
+
+    /// Width of the actor's last hidden activations.
+    pub fn latent(&self) -> usize {
+        self.actor.last().map_or(0, |&out| self.layers[out].input)
+    }
+
+    /// Variances of the entries of E (latent x A); empty without [`PolicyConfig::state_noise`].
+    pub fn noise_variances(&self, flat: &[f32]) -> Vec<f32> {
+        let range = if self.config.state_noise.is_some() { self.log_std_range() } else { 0..0 };
+        flat[range].iter().map(|s| (2.0 * s).exp()).collect()
     }
 
     /// Floats that gradients move; they come first.
@@ -173,7 +190,8 @@ impl PolicySpec {
     /// The clamped log variances that do not depend on the observation; empty where they do.
     pub fn free_logvar(&self, flat: &[f32]) -> Vec<f32> {
         let [low, high] = self.config.logvar;
-        flat[self.log_std_range()].iter().map(|s| (2.0 * s).clamp(low, high)).collect()
+        let range = if self.config.state_noise.is_none() { self.log_std_range() } else { 0..0 };
+        flat[range].iter().map(|s| (2.0 * s).clamp(low, high)).collect()
     }
 
     /// Floats of all parameters.
@@ -194,7 +212,7 @@ impl PolicySpec {
                 (d.bias.clone(), vec![d.output], d.bias_of(flat).to_vec()),
             ]
         };
-        let log_std = self.log_std.map(|_| (LOG_STD.to_string(), vec![self.action.count()], flat[self.log_std_range()].to_vec()));
+        let log_std = self.log_std.map(|_| (LOG_STD.to_string(), self.log_std_shape(), flat[self.log_std_range()].to_vec()));
         let norm = flat[self.obs_norm_range()].chunks(self.layout.dim()).zip(OBS_NORM);
         let norm = norm.map(|(v, name)| (name.to_string(), vec![v.len()], v.to_vec()));
         self.layers.iter().flat_map(named).chain(log_std).chain(norm).collect()
@@ -208,7 +226,7 @@ impl PolicySpec {
             flat.extend(tensors.f32s(&d.bias, &[d.output])?);
         }
         if self.log_std.is_some() {
-            flat.extend(tensors.f32s(LOG_STD, &[self.action.count()])?);
+            flat.extend(tensors.f32s(LOG_STD, &self.log_std_shape())?);
         }
         let extras: Vec<&str> = self.log_std.map(|_| LOG_STD).into_iter().chain(self.obs_norm.iter().flat_map(|_| OBS_NORM)).collect();
         for name in self.obs_norm.iter().flat_map(|_| OBS_NORM) {

@@ -4,7 +4,7 @@ use super::linear::dense;
 use super::pool::{Pool, check, take};
 use super::{Activation, GruCell, Linear, Source, View, ViewMut};
 use crate::Result;
-use crate::agent::{ActionSpace, Encoder, Nonlinearity, Part, PolicySpec, SLOPE};
+use crate::agent::{ActionSpace, Encoder, Nonlinearity, Part, PolicySpec, SLOPE, state_logvar};
 
 /// Most people of one task. Tens of megabytes of weights stream by for each task, so tasks are as large as the batch allows.
 const ROWS: usize = 256;
@@ -25,6 +25,8 @@ pub struct PolicyEngine {
     stem: Vec<(Linear, Activation)>,
     /// Log variances that do not depend on the observation.
     logvar: Vec<f32>,
+    /// Variances of the entries of E, where noise depends on the state.
+    noise: Vec<f32>,
     /// Means and standard deviations of observations.
     obs_norm: Vec<f32>,
     actor: Head,
@@ -66,6 +68,7 @@ impl PolicyEngine {
             cells: spec.encoders.iter().filter_map(cell).collect::<Result<_>>()?,
             stem: project.into_iter().chain(spec.shared.iter().map(plain)).collect::<Result<_>>()?,
             logvar: spec.free_logvar(flat),
+            noise: spec.noise_variances(flat),
             obs_norm: flat[spec.obs_norm_range()].to_vec(),
             actor: head(&spec.actor)?,
             critic: head(&spec.critic)?,
@@ -74,11 +77,17 @@ impl PolicyEngine {
         })
     }
 
-    /// Floats that [`PolicyEngine::forward`] writes for a person: mean A and clamped log variance A, or logits K; then value 1.
+    /// Floats that [`PolicyEngine::forward`] writes for a person: mean A and clamped log variance A, or logits K; then value 1; then,
+    /// where noise depends on the state, the actor's last hidden activations.
     pub fn output_dim(&self) -> usize {
+        self.value_at() + 1 + if self.noise.is_empty() { 0 } else { self.spec.latent() }
+    }
+
+    /// Where the value lies among them.
+    pub fn value_at(&self) -> usize {
         match self.spec.action {
-            ActionSpace::Continuous(n) => 2 * n + 1,
-            ActionSpace::Discrete(k) => k + 1,
+            ActionSpace::Continuous(n) => 2 * n,
+            ActionSpace::Discrete(k) => k,
         }
     }
 
@@ -87,13 +96,19 @@ impl PolicyEngine {
     /// # Errors
     /// If the lengths do not agree.
     pub fn forward(&self, obs: &[f32], out: &mut [f32]) -> Result<()> {
-        let width = self.output_dim();
-        let logvars = self.spec.action.count()..width - 1;
+        let (width, at) = (self.output_dim(), self.value_at());
+        let logvars = self.spec.action.count()..at;
         let [low, high] = self.spec.config.logvar;
         self.run(obs, out, width, |rows, trunk, scratch, out| {
-            self.actor.run(rows, trunk, scratch, ViewMut::new(out, width));
-            self.critic.run(rows, trunk, scratch, ViewMut::new(&mut out[width - 1..], width));
-            for row in out.chunks_exact_mut(width) {
+            let latent = self.actor.run(rows, trunk, scratch, ViewMut::new(out, width));
+            if !self.noise.is_empty() {
+                for (row, latent) in out.chunks_exact_mut(width).zip(latent.chunks_exact(self.spec.latent())) {
+                    row[at + 1..].copy_from_slice(latent);
+                    state_logvar(latent, &self.noise, &mut row[logvars.clone()]);
+                }
+            }
+            self.critic.run(rows, trunk, scratch, ViewMut::new(&mut out[at..], width));
+            for row in out.chunks_exact_mut(width).filter(|_| self.noise.is_empty()) {
                 let row = &mut row[logvars.clone()];
                 match self.logvar.is_empty() {
                     true => row.iter_mut().for_each(|v| *v = v.clamp(low, high)),
@@ -108,7 +123,9 @@ impl PolicyEngine {
     /// # Errors
     /// If the lengths do not agree.
     pub fn values(&self, obs: &[f32], out: &mut [f32]) -> Result<()> {
-        self.run(obs, out, 1, |rows, trunk, scratch, out| self.critic.run(rows, trunk, scratch, ViewMut::new(out, 1)))
+        self.run(obs, out, 1, |rows, trunk, scratch, out| {
+            self.critic.run(rows, trunk, scratch, ViewMut::new(out, 1));
+        })
     }
 
     /// Calls `heads(rows, trunk, scratch, out)` for blocks of people.
@@ -173,8 +190,8 @@ impl Head {
         self.plain.iter().map(|(layer, _)| layer.inputs().max(layer.outputs())).fold(self.out.inputs(), usize::max)
     }
 
-    /// `scratch`: at least rows x 2 [`Head::wide`].
-    fn run(&self, rows: usize, trunk: &[f32], scratch: &mut [f32], out: ViewMut) {
+    /// `scratch`: at least rows x 2 [`Head::wide`]. Gives the last hidden activations, row after row.
+    fn run<'s>(&self, rows: usize, trunk: &[f32], scratch: &'s mut [f32], out: ViewMut) -> &'s [f32] {
         let (mut h, mut inner) = scratch[..2 * rows * self.wide()].split_at_mut(rows * self.wide());
         h[..trunk.len()].copy_from_slice(trunk);
         for (layer, activation) in &self.plain {
@@ -187,6 +204,7 @@ impl Head {
             dense(second, rows, inner, h, Source::Residual, Activation::LeakyRelu(SLOPE));
         }
         self.out.forward(rows, View::new(h, self.out.inputs()), out, Source::Fresh, Activation::None);
+        &h[..rows * self.out.inputs()]
     }
 }
 
@@ -223,13 +241,16 @@ mod tests {
         let want = Network::new(spec, &flat, &burn::tensor::Device::flex()).forward(&obs);
         let floats = |data: burn::tensor::TensorData| data.try_to_vec::<f32>().unwrap();
         let (mu, value) = (floats(want.mu.into_data()), floats(want.value.into_data()));
+        let latent = floats(want.latent.into_data());
         let logvar = want.logvar.map(|v| floats(v.into_data())).unwrap_or_default();
         let close = |a: f32, b: f32| assert!((a - b).abs() < 2e-5 * (1.0 + b.abs()), "{a}, burn says {b}");
         for (p, row) in out.chunks_exact(width).enumerate() {
             (0..count).for_each(|i| close(row[i], mu[count * p + i]));
-            row[count..width - 1].iter().zip(logvar.chunks_exact(count).nth(p).unwrap_or(&[])).for_each(|(a, b)| close(*a, *b));
-            close(row[width - 1], value[p]);
-            assert_eq!(row[width - 1], values[p]);
+            row[count..engine.value_at()].iter().zip(logvar.chunks_exact(count).nth(p).unwrap_or(&[])).for_each(|(a, b)| close(*a, *b));
+            let at = engine.value_at();
+            close(row[at], value[p]);
+            assert_eq!(row[at], values[p]);
+            row[at + 1..].iter().zip(latent.chunks_exact(spec.latent()).nth(p).unwrap()).for_each(|(a, b)| close(*a, *b));
         }
         logvar
     }
@@ -251,6 +272,10 @@ mod tests {
         let free = serde_json::json!({"octaves": 2, "hidden": [9, 40, 5], "log_std": -0.05, "logvar": [-0.2, 0.3], "obs_norm": true});
         let logvar = compare(&make(free, ActionSpace::Continuous(3)));
         assert_eq!(logvar.len(), 29 * 3);
+        let noisy = serde_json::json!({"octaves": 2, "hidden": [9, 6], "state_noise": {"log_std": -1.0, "steps": 4}});
+        assert_eq!(compare(&make(noisy, ActionSpace::Continuous(3))).len(), 29 * 3);
+        let blocks = serde_json::json!({"octaves": 2, "trunk": 8, "state_noise": {"log_std": -1.0, "steps": 4}});
+        assert_eq!(compare(&make(blocks, ActionSpace::Continuous(2))).len(), 29 * 2);
         let shared = serde_json::json!({"octaves": 2, "trunk": 6, "hidden": [20, 11], "activation": "relu", "shared": true});
         assert!(compare(&make(shared, ActionSpace::Discrete(4))).is_empty());
     }

@@ -14,6 +14,19 @@ pub struct Acts {
     /// n x A log variances; empty for discrete actions.
     pub logvar: Vec<f32>,
     pub value: Vec<f32>,
+    /// What noise that depends on the state is made of, where there is such.
+    pub held: Option<Held>,
+}
+
+/// Noise h E whose E each row keeps for some steps.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Held {
+    /// n x L activations h.
+    pub latent: Vec<f32>,
+    /// L x A standard deviations of the entries of E.
+    pub deviations: Vec<f32>,
+    /// Steps for which E stays.
+    pub steps: u64,
 }
 
 impl Acts {
@@ -26,7 +39,8 @@ impl Acts {
         self.logvar.is_empty()
     }
 
-    /// Drawn actions: mean + sigma x noise, or a choice; the draws of row i come from stream (seed, purpose, step x rows + i).
+    /// Drawn actions: mean + sigma x noise, or a choice; the draws of row i come from stream (seed, purpose, step x rows + i), with
+    /// the number of draws of E in place of the step where noise is held.
     pub fn sample(&self, seed: u64, purpose: &str, step: u64) -> Vec<f32> {
         let (rows, width) = (self.value.len(), self.width());
         let stream_of = |i: usize| stream(seed, purpose, step * rows as u64 + i as u64);
@@ -35,6 +49,17 @@ impl Acts {
             return self.mu.chunks_exact(width).enumerate().map(draw).collect();
         }
         let mut out = self.mu.clone();
+        if let Some(Held { latent, deviations, steps }) = &self.held {
+            let stream_of = |i: usize| stream(seed, purpose, step / steps * rows as u64 + i as u64);
+            let latent = latent.par_chunks_exact(latent.len() / rows);
+            out.par_chunks_exact_mut(width).zip(latent).enumerate().for_each(|(i, (row, latent))| {
+                let mut noise = StandardNormal.sample_iter(stream_of(i));
+                for (h, deviations) in latent.iter().zip(deviations.chunks_exact(width)) {
+                    row.iter_mut().zip(deviations).zip(&mut noise).for_each(|((a, s), e): (_, f32)| *a += h * s * e);
+                }
+            });
+            return out;
+        }
         out.par_chunks_exact_mut(width).zip(self.logvar.par_chunks_exact(width)).enumerate().for_each(|(i, (row, logvar))| {
             let noise = StandardNormal.sample_iter(stream_of(i));
             row.iter_mut().zip(logvar).zip(noise).for_each(|((a, v), e): (_, f32)| *a += (0.5 * v).exp() * e);
@@ -72,7 +97,7 @@ mod tests {
     fn choices_come_as_often_as_they_should() {
         let rows = 20_000;
         let p = [0.125f32, 0.5, 0.375];
-        let acts = Acts { mu: p.map(f32::ln).repeat(rows), logvar: vec![], value: vec![0.0; rows] };
+        let acts = Acts { mu: p.map(f32::ln).repeat(rows), logvar: vec![], value: vec![0.0; rows], held: None };
         let drawn = acts.sample(1, "test", 0);
         for (choice, p) in p.into_iter().enumerate() {
             let share = drawn.iter().filter(|&&a| a == choice as f32).count() as f32 / rows as f32;
@@ -82,5 +107,22 @@ mod tests {
         assert!(acts.best().iter().all(|&a| a == 1.0));
         assert!((acts.log_prob(&drawn)[0] - p[drawn[0] as usize].ln()).abs() < 1e-6);
         assert_ne!(drawn, acts.sample(1, "test", 1));
+    }
+
+    /// h = (1, 2), deviations 0.5 and 0.25: the noise has variance 0.25 + 4/16, and stays as long as E and h do.
+    #[test]
+    fn held_noise_by_hand() {
+        let rows = 20_000;
+        let held = Held { latent: [1.0, 2.0].repeat(rows), deviations: vec![0.5, 0.25], steps: 3 };
+        let mut acts = Acts { mu: vec![0.1; rows], logvar: vec![0.5f32.ln(); rows], value: vec![0.0; rows], held: Some(held) };
+        let [first, same, other] = [3, 5, 6].map(|step| acts.sample(1, "test", step));
+        assert_eq!(first, same);
+        assert_ne!(first, other);
+        let variance = first.iter().map(|a| (a - 0.1).powi(2)).sum::<f32>() / rows as f32;
+        // Four standard deviations of a variance's estimate.
+        assert!((variance - 0.5).abs() < 4.0 * 0.5 * (2.0 / rows as f32).sqrt(), "{variance}");
+        acts.held.as_mut().unwrap().latent = [2.0, 4.0].repeat(rows);
+        let twice = acts.sample(1, "test", 4);
+        assert!(first.iter().zip(&twice).all(|(a, b)| (2.0 * (a - 0.1) - (b - 0.1)).abs() < 1e-5), "the noise follows the state");
     }
 }

@@ -7,7 +7,7 @@
 use crate::ppo::Progress;
 use crate::recipe::CheckpointConfig;
 use crate::stats::EpochStats;
-use crate::{AdamW, Error, Result};
+use crate::{AdamW, Error, Result, RewardScaling};
 use egogen::agent::{ActionSpace, ObsLayout, PolicyConfig, PolicySpec};
 use egogen::io::{Precision, Tensors, content_hash, pack_tensors, sync_folder, write_atomic};
 use serde::{Deserialize, Serialize};
@@ -15,8 +15,8 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-const FORMAT: u32 = 3;
-/// Oldest format that is read: it has no `recipe.toml` and no [`State::last_epoch`].
+const FORMAT: u32 = 4;
+/// Oldest format that is read: it has no `recipe.toml` and no [`State::last_epoch`]. No format below 4 has [`State::scaling`].
 const OLDEST: u32 = 2;
 pub(crate) const DESCRIPTION: &str = "checkpoint.json";
 const MODEL: &str = "model.safetensors";
@@ -78,6 +78,8 @@ pub struct State {
     pub collector: Vec<u8>,
     /// Figures of the last whole epoch.
     pub last_epoch: BTreeMap<String, f64>,
+    /// Scale of rewards.
+    pub scaling: RewardScaling,
 }
 
 /// A whole checkpoint in memory.
@@ -154,6 +156,10 @@ impl Checkpoint {
             // postcard writes fields one after the other, and an empty map as one zero.
             state.push(0);
         }
+        if description.format < FORMAT {
+            let none = postcard::to_stdvec(&RewardScaling::default());
+            state.extend(none.map_err(|e| Error::run(format!("cannot read an older checkpoint: {e}")))?);
+        }
         let state: State = postcard::from_bytes(&state).map_err(|e| egogen::Error::file(dir.join(STATE), e.to_string()))?;
         if (description.epoch, description.env_steps) != (state.epoch, state.env_steps) {
             let what = format!("is of epoch {}, but {STATE} is of epoch {}", description.epoch, state.epoch);
@@ -200,7 +206,7 @@ impl Checkpoint {
             newer if newer > FORMAT => {
                 Err(bad(format!("format is {newer}, from a newer version of this program; expected at most {FORMAT}")))
             }
-            older => Err(bad(format!("format is {older}, which can no longer be read; expected {OLDEST} or {FORMAT}"))),
+            older => Err(bad(format!("format is {older}, which can no longer be read; expected {OLDEST} to {FORMAT}"))),
         }
     }
 }

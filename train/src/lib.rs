@@ -20,6 +20,7 @@ pub mod program;
 pub mod recipe;
 pub mod registry;
 mod running;
+mod scaling;
 mod schedule;
 mod seeds;
 mod shards;
@@ -38,6 +39,7 @@ pub use optim::{AdamConfig, AdamW, clip_scale, global_norm};
 pub use policy::{Compute, Policy};
 pub use ppo::{Learner, PpoConfig, PriorForm, Progress, Rules, UpdateStats};
 pub use running::Running;
+pub use scaling::RewardScaling;
 pub use schedule::Schedule;
 pub use shards::Shards;
 

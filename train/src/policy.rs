@@ -1,6 +1,6 @@
 //! The policy as it acts: no gradients, a batch of observations in, plain floats out.
 
-use crate::acts::Acts;
+use crate::acts::{Acts, Held};
 use crate::{Error, Result};
 use burn::tensor::{Device, Tensor};
 use egogen::agent::{Network, PolicySpec};
@@ -25,6 +25,8 @@ impl Compute {
 pub struct Policy {
     spec: PolicySpec,
     acting: Acting,
+    /// Standard deviations of the entries of E, where noise depends on the state.
+    deviations: Vec<f32>,
 }
 
 enum Acting {
@@ -39,25 +41,37 @@ impl Policy {
             Compute::Own => Acting::Own(Box::new(PolicyEngine::new(spec, params)?)),
             Compute::Burn(device) => Acting::Burn(Box::new(Network::new(spec, params, device))),
         };
-        Ok(Self { spec: spec.clone(), acting })
+        let deviations = spec.noise_variances(params).iter().map(|v| v.sqrt()).collect();
+        Ok(Self { spec: spec.clone(), acting, deviations })
     }
 
     /// What the policy says of observation rows.
     pub fn act(&self, obs: &[f32]) -> Result<Acts> {
         match &self.acting {
             Acting::Own(engine) => {
-                let (a, width) = (self.spec.action.count(), engine.output_dim());
+                let (a, at, width) = (self.spec.action.count(), engine.value_at(), engine.output_dim());
                 let mut out = vec![0.0; obs.len() / self.spec.layout.dim() * width];
                 engine.forward(obs, &mut out)?;
                 let columns = |from: usize, to: usize| out.chunks_exact(width).flat_map(|row| &row[from..to]).copied().collect();
-                Ok(Acts { mu: columns(0, a), logvar: columns(a, width - 1), value: columns(width - 1, width) })
+                Ok(Acts {
+                    mu: columns(0, a),
+                    logvar: columns(a, at),
+                    value: columns(at, at + 1),
+                    held: self.held(|| Ok(columns(at + 1, width)))?,
+                })
             }
             Acting::Burn(network) => {
                 let out = network.forward(obs);
                 let logvar = out.logvar.map(floats).transpose()?.unwrap_or_default();
-                Ok(Acts { mu: floats(out.mu)?, logvar, value: floats(out.value)? })
+                let held = self.held(|| floats(out.latent))?;
+                Ok(Acts { mu: floats(out.mu)?, logvar, value: floats(out.value)?, held })
             }
         }
+    }
+
+    fn held(&self, latent: impl FnOnce() -> Result<Vec<f32>>) -> Result<Option<Held>> {
+        let Some(noise) = self.spec.config.state_noise else { return Ok(None) };
+        Ok(Some(Held { latent: latent()?, deviations: self.deviations.clone(), steps: noise.steps }))
     }
 
     /// Values alone.

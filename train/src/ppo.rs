@@ -54,6 +54,9 @@ pub struct PpoConfig {
     /// Values, advantages and returns are computed again before each pass but the first.
     #[serde(default)]
     pub recompute_advantage: bool,
+    /// Rewards are divided by the running standard deviation of discounted sums of rewards and cut to +-10, before all else.
+    #[serde(default)]
+    pub reward_scaling: bool,
     /// The critic learns returns divided by their running standard deviation.
     #[serde(default)]
     pub reward_normalization: bool,

@@ -18,14 +18,14 @@ impl Default for Running {
 
 impl Running {
     /// Adds a batch.
-    pub fn add(&mut self, batch: impl Iterator<Item = f32> + Clone) {
+    pub fn add(&mut self, batch: impl Iterator<Item: Into<f64>> + Clone) {
         let (mut n, mut sum) = (0.0, 0.0);
-        batch.clone().for_each(|x| (n, sum) = (n + 1.0, sum + f64::from(x)));
+        batch.clone().for_each(|x| (n, sum) = (n + 1.0, sum + x.into()));
         if n == 0.0 {
             return;
         }
         let mean = sum / n;
-        let square: f64 = batch.map(|x| (f64::from(x) - mean).powi(2)).sum();
+        let square: f64 = batch.map(|x| (x.into() - mean).powi(2)).sum();
         let (delta, total) = (mean - self.mean, self.count + n);
         self.variance = (self.variance * self.count + square + delta * delta * self.count * n / total) / total;
         self.mean += delta * n / total;

@@ -12,7 +12,7 @@ use crate::shards::Shards;
 use crate::start::{INIT, Start, check_best, find, initial, policy_spec, seen};
 use crate::stats::{Episodes, EpochStats, Row};
 use crate::tensorboard::TensorBoard;
-use crate::{AdamW, Error, Result};
+use crate::{AdamW, Error, Result, RewardScaling};
 use egogen::agent::bundle::{Bundle, Trained};
 use egogen::io::write_atomic;
 use egogen_envs::{EnvSpec, VecEnv};
@@ -42,6 +42,7 @@ pub struct Trainer {
     collector: Collector,
     test_env: Box<dyn VecEnv>,
     learner: Learner,
+    scaling: RewardScaling,
     epoch: u64,
     env_steps: u64,
     stats: EpochStats,
@@ -124,6 +125,7 @@ impl Trainer {
             env_spec,
             collector,
             test_env,
+            scaling: state.scaling,
             epoch: state.epoch,
             env_steps: state.env_steps,
             stats: state.stats,
@@ -200,7 +202,10 @@ impl Trainer {
     fn update(&mut self, clock: &mut Clock) -> Result<()> {
         let recipe = &self.plan.recipe;
         let start = Instant::now();
-        let rollout = self.collector.collect(self.learner.policy(), self.plan.horizon)?;
+        let mut rollout = self.collector.collect(self.learner.policy(), self.plan.horizon)?;
+        if recipe.ppo.reward_scaling {
+            self.scaling.apply(&mut rollout, recipe.run.envs, recipe.ppo.gamma);
+        }
         clock.collect += start.elapsed().as_secs_f64();
         let start = Instant::now();
         let updates = recipe.run.epochs * self.plan.updates_per_epoch;
@@ -284,6 +289,7 @@ impl Trainer {
                 stats: self.stats.clone(),
                 collector: self.collector.save()?,
                 last_epoch: self.last_epoch.clone(),
+                scaling: self.scaling.clone(),
             },
         };
         let root = self.dir.join("checkpoints");

@@ -70,6 +70,11 @@ impl Head {
         Self { plain, inputs, inner, out }
     }
 
+    /// What the output layer sees.
+    pub fn latent(&self) -> &[f32] {
+        &self.inputs[self.inputs.len() - 1]
+    }
+
     /// From the gradient of the output to that of the trunk.
     pub fn backward(&self, spec: &PolicySpec, flat: &[f32], layers: &[usize], d: Vec<f32>, grad: &mut [f32]) -> Vec<f32> {
         let (blocks, last) = layers.split_at(layers.len() - 1);

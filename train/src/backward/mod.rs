@@ -57,6 +57,11 @@ impl<'a> Tape<'a> {
         &self.actor.out
     }
 
+    /// rows x `spec.latent()`: the actor's last hidden activations.
+    pub fn latent(&self) -> &[f32] {
+        self.actor.latent()
+    }
+
     /// rows values.
     pub fn value(&self) -> &[f32] {
         &self.critic.out

@@ -4,7 +4,7 @@ use super::{Batch, Losses};
 use crate::PpoConfig;
 use crate::backward::Tape;
 use crate::ppo::PriorForm;
-use egogen::agent::{ActionSpace, PolicySpec, log_prob_of, log_softmax_of};
+use egogen::agent::{ActionSpace, PolicySpec, log_prob_of, log_softmax_of, state_logvar};
 use std::f64::consts::TAU;
 use std::ops::Range;
 
@@ -16,11 +16,12 @@ pub(super) fn shard(spec: &PolicySpec, params: &[f32], batch: &Batch, rows: Rang
     let mut d_action = vec![0.0; rows.len() * outputs];
     let mut d_value = Vec::with_capacity(rows.len());
     let (mut losses, mut ratio_error) = (Losses::default(), 0.0f64);
-    // Log variances that do not depend on the observation: before the clamp, their gradient in a row and in all.
-    let free: Vec<f32> = params[spec.log_std_range()].iter().map(|s| 2.0 * s).collect();
-    let (mut d_row, mut d_free) = (free.clone(), vec![0.0; free.len()]);
-    let said = tape.action().chunks_exact(outputs).zip(tape.value());
-    for ((i, (out, &value)), d) in rows.zip(said).zip(d_action.chunks_exact_mut(outputs)) {
+    // Log variances that the network does not give, before the clamp: their gradient in a row, and that of what they come from in all.
+    let (noise, log_std) = (spec.noise_variances(params), &params[spec.log_std_range()]);
+    let mut free: Vec<f32> = log_std.iter().take(width).map(|s| 2.0 * s).collect();
+    let (mut d_row, mut d_free) = (free.clone(), vec![0.0; log_std.len()]);
+    let said = tape.action().chunks_exact(outputs).zip(tape.value()).zip(tape.latent().chunks_exact(spec.latent()));
+    for ((i, ((out, &value), latent)), d) in rows.zip(said).zip(d_action.chunks_exact_mut(outputs)) {
         let (error, moves) = value_error(value, batch.old_value[i], batch.returns[i], ppo);
         losses.value += error * error / f64::from(count);
         d_value.push(if moves { ppo.value * 2.0 * error as f32 / count } else { 0.0 });
@@ -31,6 +32,14 @@ pub(super) fn shard(spec: &PolicySpec, params: &[f32], batch: &Batch, rows: Rang
             ActionSpace::Continuous(_) if free.is_empty() => {
                 let (out, d) = (out.split_at(width), d.split_at_mut(width));
                 row.gaussian(out, spec.config.logvar, d, &mut losses)
+            }
+            ActionSpace::Continuous(_) if !noise.is_empty() => {
+                state_logvar(latent, &noise, &mut free);
+                let beyond = row.gaussian((out, &free), [f32::NEG_INFINITY, f32::INFINITY], (d, &mut d_row), &mut losses);
+                for ((h, v), sum) in latent.iter().zip(noise.chunks_exact(width)).zip(d_free.chunks_exact_mut(width)) {
+                    (0..width).for_each(|k| sum[k] += d_row[k] * h * h * v[k] * (-free[k]).exp());
+                }
+                beyond
             }
             ActionSpace::Continuous(_) => {
                 let beyond = row.gaussian((out, &free), spec.config.logvar, (d, &mut d_row), &mut losses);

@@ -163,3 +163,42 @@ fn small_networks_learn_as_with_tianshou() {
         }
     }
 }
+
+/// Noise that depends on the state by Stable-Baselines3's own distribution (tests/tools/sb3/make.py). At ratio 1 the loss's gradient is
+/// that of -mean (A log p + 0.3 H).
+#[test]
+fn state_dependent_noise_agrees_with_stable_baselines() {
+    let t = Tensors::read(concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/fixtures/sb3.safetensors")).unwrap();
+    let get = |name: &str, shape: &[usize]| t.f32s(&format!("gsde.{name}"), shape).unwrap();
+    let layout = ObsLayout::new(vec![ObsGroup { name: "state".into(), shape: vec![3] }]);
+    let config = serde_json::json!({"hidden": [5], "state_noise": {"log_std": 0.0, "steps": 1}});
+    let spec = PolicySpec::new(serde_json::from_value(config).unwrap(), layout, 2).unwrap();
+    // The critic, which the fixture does not have, is zero, and so are its gradients.
+    let flat = |prefix: &str| {
+        let zeros = spec.to_tensors(&vec![0.0; spec.params()]);
+        let named = |(name, shape, zero): (String, Vec<usize>, Vec<f32>)| t.f32s(&format!("{prefix}{name}"), &shape).unwrap_or(zero);
+        zeros.into_iter().flat_map(named).collect::<Vec<f32>>()
+    };
+    let (params, mut grads) = (flat("gsde/"), flat("gsde/gradient/"));
+    grads.iter_mut().for_each(|g| *g /= -11.0);
+    let batch = Batch {
+        obs: get("obs", &[11, 3]),
+        actions: get("action", &[11, 2]),
+        old_log_prob: get("log_prob", &[11]),
+        old_value: vec![0.0; 11],
+        advantage: get("weights", &[11]),
+        returns: vec![0.0; 11],
+    };
+    let ppo = ppo(serde_json::json!({"entropy": 0.3, "advantage_normalization": false}));
+    everywhere(|compute, shards, what| {
+        let acts = Policy::new(&spec, &params, compute).unwrap().act(&batch.obs).unwrap();
+        assert_close(&acts.mu, &get("mean", &[11, 2]), what);
+        assert_close(&acts.logvar, &get("logvar", &[11, 2]), what);
+        assert_close(&acts.log_prob(&batch.actions), &batch.old_log_prob, what);
+        let (have, losses, error) = gradients(&spec, &params, compute, shards, &batch, &ppo).unwrap();
+        assert!(error < 1e-5, "{what}: ratio off by {error}");
+        assert_gradients(&spec, &have, &grads, what);
+        let entropy = get("entropy", &[11]).iter().sum::<f32>() / 11.0;
+        assert_close(&[losses.entropy as f32], &[entropy], what);
+    });
+}

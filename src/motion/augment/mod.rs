@@ -46,7 +46,7 @@ pub enum Kind {
 
 /// Variations made of every clip (each also mirrored).
 pub const RECIPE: [(Kind, usize); 7] =
-    [(Kind::Bent, 2), (Kind::SlowBent, 2), (Kind::Stop, 2), (Kind::Small, 1), (Kind::Spot, 1), (Kind::Side, 2), (Kind::Reversed, 1)];
+    [(Kind::Bent, 2), (Kind::SlowBent, 2), (Kind::Stop, 2), (Kind::Small, 1), (Kind::Spot, 1), (Kind::Side, 1), (Kind::Reversed, 1)];
 
 /// Variations of `clips` within the limits of slide and hip twist, and how many were made; `seed` fixes all draws. `idle`: people
 /// who stand; without any, stops are mere stops.

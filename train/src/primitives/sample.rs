@@ -30,21 +30,20 @@ fn put(to: &mut [f32], rows: usize, t: usize, row: usize, frame: &[f32]) {
     to[at..at + MARKER_DIM].copy_from_slice(frame);
 }
 
-/// The manoeuvre of the primitive at `start`: classes of speed, change of speed, sideways speed, and turn.
-fn manoeuvre(set: &MotionSet, clip: usize, start: usize) -> [i32; 4] {
+/// The manoeuvre of the primitive at `start`: classes of speed, change of speed, and turn.
+fn manoeuvre(set: &MotionSet, clip: usize, start: usize) -> [i32; 3] {
     let frame = |t: usize| set.frame(clip, start + t);
-    let way = |a: usize, b: usize| frame(a).inverse().point(frame(b).transl);
-    let half = |a: usize, b: usize| way(a, b).y;
-    let (first, second, side) = (half(0, FRAMES / 2), half(FRAMES / 2, FRAMES - 1), way(0, FRAMES - 1).x);
+    let half = |a: usize, b: usize| frame(a).inverse().point(frame(b).transl).y;
+    let (first, second) = (half(0, FRAMES / 2), half(FRAMES / 2, FRAMES - 1));
     let x = frame(0).inverse().dir(frame(FRAMES - 1).rot.x_axis);
     let class = |v: f32, width: f32, most: i32| ((v / width).round() as i32).clamp(-most, most);
-    // Half a primitive takes a quarter of a second: 0.3 m/s, 0.25 m/s, 0.2 m/s and 10 degrees.
+    // Half a primitive takes a quarter of a second: 0.3 m/s, 0.25 m/s and 10 degrees.
     let turn = x.y.atan2(x.x);
-    [class(first, 0.075, 6), class(second - first, 0.06, 4), class(side, 0.1, 2), class(turn, 10f32.to_radians(), 5)]
+    [class(first, 0.075, 6), class(second - first, 0.06, 4), class(turn, 10f32.to_radians(), 5)]
 }
 
 /// Weights that even out how often each class is drawn (see [`Settings::favour`](super::settings::Settings)).
-fn even_out(classes: &[[i32; 4]], favour: f32) -> Vec<f32> {
+fn even_out(classes: &[[i32; 3]], favour: f32) -> Vec<f32> {
     let mut counts = BTreeMap::new();
     classes.iter().for_each(|c| *counts.entry(c).or_insert(0u32) += 1);
     classes.iter().map(|c| (counts[c] as f32).powf(-favour)).collect()
@@ -72,7 +71,7 @@ impl<'a> Lanes<'a> {
         if windows.is_empty() {
             return Err(Error::invalid(format!("no clip holds {FRAMES} frames")));
         }
-        let classes: Vec<[i32; 4]> = windows.par_iter().map(|&(clip, start)| manoeuvre(set, clip, start)).collect();
+        let classes: Vec<[i32; 3]> = windows.par_iter().map(|&(clip, start)| manoeuvre(set, clip, start)).collect();
         let single: BTreeMap<(usize, usize), f32> = windows.iter().copied().zip(even_out(&classes, favour)).collect();
         // A start counts as the mean of the primitives that follow.
         let weight = |&(clip, start): &(usize, usize)| -> f64 {
@@ -308,7 +307,7 @@ mod tests {
 
     #[test]
     fn rare_classes_are_favoured() {
-        let (common, rare) = ([0, 0, 0, 1], [2, 0, 0, 0]);
+        let (common, rare) = ([0, 0, 1], [2, 0, 0]);
         let w = even_out(&[common, common, common, common, rare], 0.6);
         // Together the four weigh 4^0.4 against 1.
         assert!((w[..4].iter().sum::<f32>() / w[4] - 4f32.powf(0.4)).abs() < 1e-5);

@@ -57,8 +57,8 @@ pub fn floor_penetration(markers: &[f32]) -> f32 {
     mean(frames(markers).map(|m| m.iter().skip(2).step_by(3).fold(0.0f32, |deep, &z| deep.max(-z))))
 }
 
-/// Position in [`FOOT_MARKERS`] of the marker that bears the body in frame `m` (201): the lowest one, if it is below 5 cm.
-pub fn standing_marker(m: &[f32]) -> Option<usize> {
+/// Position in [`FOOT_MARKERS`] of the marker the body stands on.
+fn standing_marker(m: &[f32]) -> Option<usize> {
     let height = |k: usize| marker(m, FOOT_MARKERS[k]).z;
     let lowest = (1..FOOT_MARKERS.len()).fold(0, |low, k| if height(k) < height(low) { k } else { low });
     (height(lowest) < STANCE_HEIGHT).then_some(lowest)

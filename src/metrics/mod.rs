@@ -4,6 +4,6 @@ mod feet;
 mod prior;
 mod proportions;
 
-pub use feet::{contact_score, floor_penetration, foot_heights, foot_speeds, stance_slide, standing_marker};
+pub use feet::{contact_score, floor_penetration, foot_heights, foot_speeds, stance_slide};
 pub use prior::{kl_mean_only, kl_to_standard};
 pub use proportions::{bone_length_error, rigid_marker_error};

@@ -171,7 +171,7 @@ impl<'a> Run<'a> {
         let s = self.place.settings.clone();
         let rows = s.batch[self.place.stage];
         // Early samples of the prior have no feet to speak of.
-        let loss_weights = LossWeights { slide: if depth > 1 { s.loss.slide } else { 0.0 }, ..s.loss };
+        let loss_weights = LossWeights { contact: if depth > 1 { s.loss.contact } else { 0.0 }, ..s.loss };
         let mut lanes = Lanes::new(self.set, rows, depth, s.favour)?;
         let regressor = Regressor::new(&self.regressor.weights)?;
         let mut shards: Vec<(predictor::Tape, PredictorWeights)> =
@@ -199,7 +199,7 @@ impl<'a> Run<'a> {
             self.place.step += 1;
             let share = 1.0 / parts.len() as f32;
             let mean = |f: fn(&LossParts) -> f32| parts.iter().map(f).sum::<f32>() * share;
-            let figures = [mean(|p| p.reconstruction), mean(|p| p.velocity), mean(|p| p.kl), mean(|p| p.skate), mean(|p| p.slide)];
+            let figures = [mean(|p| p.reconstruction), mean(|p| p.velocity), mean(|p| p.kl), mean(|p| p.skate), mean(|p| p.contact)];
             progress.step(self.place.step, fraction, rate, &figures)?;
             if self.place.step.is_multiple_of(WATCH_EVERY) {
                 progress.held_out(self.place.step, held_out_error(&self.predictor.weights, self.held_out)?)?;

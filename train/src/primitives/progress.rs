@@ -37,7 +37,7 @@ impl Progress {
     pub fn new(out: &Path, stage: Stage, step: u64) -> Result<Self> {
         let names: &[&str] = match stage {
             Stage::Body => &["loss", "marker_distance"],
-            _ => &["reconstruction", "velocity", "kl", "skate", "slide"],
+            _ => &["reconstruction", "velocity", "kl", "skate", "contact"],
         };
         let path = out.join(format!("{}.csv", format!("{stage:?}").to_lowercase()));
         fs::create_dir_all(out).map_err(|e| Error::io(out, e))?;

@@ -77,7 +77,7 @@ impl Settings {
         let shares = (self.shares.iter().sum::<f64>() - 1.0).abs() < 1e-6 && self.shares.iter().all(|s| *s > 0.0);
         expect("shares", shares, format!("{:?}", self.shares), "numbers above 0 that add up to 1")?;
         let l = &self.loss;
-        for (key, v) in [("velocity", l.velocity), ("kl", l.kl), ("skate", l.skate), ("slide", l.slide)] {
+        for (key, v) in [("velocity", l.velocity), ("kl", l.kl), ("skate", l.skate), ("contact", l.contact)] {
             expect(&format!("loss.{key}"), v >= 0.0 && v.is_finite(), v.to_string(), "0 or more")?;
         }
         Ok(())
@@ -105,7 +105,7 @@ mod tests {
             ("loss.klx=1", "klx"),
             ("frames=mine", "mine"),
             ("depth=9", "depth is 9, expected 1 to 8"),
-            ("loss.slide=-1.0", "loss.slide is -1"),
+            ("loss.contact=-1.0", "loss.contact is -1"),
             ("favour=2.0", "favour is 2"),
             ("steps=[1, 0, 1]", "steps is [1, 0, 1]"),
             ("shares=[0.5, 0.5, 0.5]", "shares is"),

@@ -1,8 +1,8 @@
 //! Training of the motion model: through the program where the recordings are at hand, through the library otherwise.
 
-use egogen::body::{BETAS, BodyModel, MARKER_DIM, PARAMS};
+use egogen::body::{BETAS, BodyModel};
 use egogen::io::Tensors;
-use egogen::motion::primitive::{ClipMarkers, JOINT_DIM, MotionSet};
+use egogen::motion::primitive::{ClipMarkers, MotionSet};
 use egogen::sim::World;
 use egogen_envs::motion::{MotionEnv, MotionTask};
 use egogen_train::evaluate::{Actor, play};
@@ -21,18 +21,7 @@ fn wandering() -> MotionSet {
     let world = World::embedded().unwrap();
     let mut env = MotionEnv::evaluation(MotionTask::default(), world.sim.clone(), world.held_out.clone(), 6, 1).unwrap();
     let body = world.sim.body().shape(&[0.0; BETAS]);
-    let clip = |params: Vec<f32>| {
-        let (mut markers, mut joints) = (vec![], vec![]);
-        for p in params.chunks_exact(PARAMS) {
-            let (mut m, mut j) = ([0.0; MARKER_DIM], [0.0; JOINT_DIM]);
-            let posed = body.pose(p);
-            body.markers(&posed, &mut m);
-            posed.write_joints(&mut j);
-            markers.extend(m);
-            joints.extend(j);
-        }
-        ClipMarkers { name: "wandering".into(), markers, params, joints }
-    };
+    let clip = |params: Vec<f32>| ClipMarkers::from_params("wandering".into(), &body, params);
     let films = play(&mut env, &Actor::Prior, 1, true).unwrap().into_iter().filter_map(|p| p.film);
     MotionSet { clips: films.map(|f| clip(f.frames)).collect() }
 }

@@ -30,26 +30,39 @@ pub fn contact_score(markers: &[f32]) -> f32 {
     mean(each.map(|(z, v)| (-(z.abs() - 0.05).max(0.0) - (v - 0.075).max(0.0)).exp()))
 }
 
-/// How far the standing foot slides, metres per stance; 0 where there is no stance.
+/// Horizontal travel of the standing foot from each frame to the next, metres (T - 1 values); none where no foot stands or the
+/// standing foot changes.
 ///
-/// The standing foot of a frame is the one with the lowest marker, if that is below 5 cm. A stance is a run of frames on the
-/// same foot; its slide is the horizontal travel, summed over its frames, of the marker that is lowest at the start of each step.
-pub fn stance_slide(markers: &[f32]) -> f32 {
+/// The standing foot of a frame is the one with the lowest marker, if that is below 5 cm; what travels is this marker.
+pub fn stance_moves(markers: &[f32]) -> impl ExactSizeIterator<Item = Option<f32>> + '_ {
     let next = markers.get(MARKER_DIM..).unwrap_or(&[]);
-    let (mut travel, mut stances, mut before) = (0.0f32, 0, None);
-    for (now, after) in frames(markers).zip(frames(next)) {
-        let standing = standing_marker(now);
-        let foot = standing.map(|k| k / PER_FOOT);
-        if let Some(k) = standing.filter(|_| foot == standing_marker(after).map(|k| k / PER_FOOT)) {
-            let i = FOOT_MARKERS[k];
-            travel += (marker(after, i) - marker(now, i)).truncate().length();
-            stances += usize::from(before != foot);
-            before = foot;
-        } else {
-            before = None;
+    frames(markers).zip(frames(next)).map(|(now, after)| {
+        let k = standing_marker(now)?;
+        let foot = |k: usize| k / PER_FOOT;
+        let i = FOOT_MARKERS[k];
+        (standing_marker(after).map(foot) == Some(foot(k))).then(|| (marker(after, i) - marker(now, i)).truncate().length())
+    })
+}
+
+/// How far the standing foot slides in each stance, metres: the sum of [`stance_moves`] over a run of frames on the same foot.
+pub fn stance_slides(markers: &[f32]) -> Vec<f32> {
+    let mut slides: Vec<f32> = Vec::new();
+    let mut standing = false;
+    for travel in stance_moves(markers) {
+        match (travel, slides.last_mut()) {
+            (Some(d), Some(slide)) if standing => *slide += d,
+            (Some(d), _) => slides.push(d),
+            (None, _) => {}
         }
+        standing = travel.is_some();
     }
-    if stances == 0 { 0.0 } else { travel / stances as f32 }
+    slides
+}
+
+/// Mean of [`stance_slides`], metres per stance; 0 where there is no stance.
+pub fn stance_slide(markers: &[f32]) -> f32 {
+    let slides = stance_slides(markers);
+    if slides.is_empty() { 0.0 } else { mean(slides.into_iter()) }
 }
 
 /// Mean over the frames of how deep the lowest of all markers stands under the floor, metres. NaN without frames.
@@ -123,6 +136,8 @@ mod tests {
             [0.01 * (1 + foot) as f32 * t as f32, 0.0, if foot == standing { 0.0 } else { 0.2 }]
         });
         assert!(near(stance_slide(&m), (3.0 * 0.01 + 3.0 * 0.02) / 2.0));
+        let moves: Vec<_> = stance_moves(&m).collect();
+        assert!(moves.len() == 7 && moves[3].is_none() && near(moves[2].unwrap(), 0.01) && near(moves[4].unwrap(), 0.02));
         assert_eq!(stance_slide(&film(8, |t, _| [t as f32, 0.0, 0.1])), 0.0);
     }
 

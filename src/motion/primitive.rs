@@ -29,15 +29,20 @@ pub struct MotionSet {
 impl ClipMarkers {
     /// Poses `body` through `clip`.
     pub fn new(skeleton: &Skeleton, body: &ShapedBody, clip: &Clip) -> Self {
-        let params: Vec<f32> = clip.params(skeleton).into_iter().flatten().collect();
-        let mut markers = vec![0.0; clip.len() * MARKER_DIM];
-        let mut joints = vec![0.0; clip.len() * JOINT_DIM];
+        Self::from_params(clip.name.clone(), body, clip.params(skeleton).into_iter().flatten().collect())
+    }
+
+    /// Poses `body` by `params` (T x 93, world).
+    pub fn from_params(name: String, body: &ShapedBody, params: Vec<f32>) -> Self {
+        let frames = params.len() / PARAMS;
+        let mut markers = vec![0.0; frames * MARKER_DIM];
+        let mut joints = vec![0.0; frames * JOINT_DIM];
         for ((p, m), j) in params.chunks_exact(PARAMS).zip(markers.chunks_exact_mut(MARKER_DIM)).zip(joints.chunks_exact_mut(JOINT_DIM)) {
             let posed = body.pose(p);
             body.markers(&posed, m);
             posed.write_joints(j);
         }
-        Self { name: clip.name.clone(), markers, params, joints }
+        Self { name, markers, params, joints }
     }
 
     /// Frames.

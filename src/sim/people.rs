@@ -163,6 +163,17 @@ impl PersonMut<'_> {
 }
 
 impl Primitives {
+    /// Adds person `i`'s bodies, which have the shape of `body`, to its recording `film` (T x 93, world): all 20 frames to an empty
+    /// one, else the 18 new ones, whose seed the recording ends with.
+    pub fn record(&self, i: usize, body: &ShapedBody, film: &mut Vec<f32>) {
+        let first = if film.is_empty() { 0 } else { SEED };
+        for frame in self.params[(i * FRAMES + first) * PARAMS..(i + 1) * FRAMES * PARAMS].chunks_exact(PARAMS) {
+            let at = film.len();
+            film.extend_from_slice(frame);
+            body.transform_params(&mut film[at..], &self.frames[i]);
+        }
+    }
+
     /// Makes room for `n` people; the content is then overwritten by a step.
     pub(super) fn resize(&mut self, n: usize) {
         self.frames.resize(n, Frame::IDENTITY);

@@ -105,12 +105,7 @@ impl Running {
         let figures = [body_error(&shaped, markers, params), pose_norm, contact_score(markers), stance_slide(markers), kl[0], kl[1]];
         self.sums.iter_mut().zip(figures).for_each(|(sum, x)| *sum += x);
         if record {
-            let from = if self.steps == 0.0 { 0 } else { SEED };
-            for frame in params.chunks_exact(PARAMS).skip(from) {
-                let at = self.film.frames.len();
-                self.film.frames.extend_from_slice(frame);
-                shaped.transform_params(&mut self.film.frames[at..], &prims.frames[i]);
-            }
+            prims.record(i, &shaped, &mut self.film.frames);
         }
         self.steps += 1.0;
     }

@@ -6,4 +6,4 @@ mod report;
 
 pub use actors::{Actor, Greedy};
 pub use episodes::{Film, Played, play};
-pub use report::{Estimate, Row, mean, proportion, table};
+pub use report::{Estimate, Row, mean, proportion, ratio, table};

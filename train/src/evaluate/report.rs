@@ -29,16 +29,28 @@ pub fn proportion(hits: usize, n: usize) -> Estimate {
 
 /// A mean with its percentile-bootstrap interval; the resampling is fixed. None without values or where one is not finite.
 pub fn mean(values: &[f32]) -> Option<Estimate> {
-    if values.is_empty() || values.iter().any(|v| !v.is_finite()) {
+    ratio(&values.iter().map(|&v| [f64::from(v), 1.0]).collect::<Vec<_>>())
+}
+
+/// The sum of the first over the sum of the second number, with its percentile-bootstrap interval over the pairs: a mean of groups
+/// of unequal size, whose members are not independent. None where the second sum is 0 or a number is not finite.
+pub fn ratio(pairs: &[[f64; 2]]) -> Option<Estimate> {
+    let over = |pairs: &mut dyn Iterator<Item = &[f64; 2]>| {
+        let [a, b] = pairs.fold([0.0, 0.0], |[a, b], [x, y]| [a + x, b + y]);
+        a / b
+    };
+    let value = over(&mut pairs.iter());
+    if !value.is_finite() {
         return None;
     }
     let mut rng = stream(0, "bootstrap", 0);
-    let n = values.len();
-    let average = |sum: f64| sum / n as f64;
-    let mut means: Vec<f64> = (0..RESAMPLES).map(|_| average((0..n).map(|_| f64::from(values[rng.random_range(0..n)])).sum())).collect();
-    means.sort_by(f64::total_cmp);
-    let at = |q: f64| means[((RESAMPLES - 1) as f64 * q).round() as usize];
-    Some(Estimate { value: average(values.iter().map(|&v| f64::from(v)).sum()), low: at(0.025), high: at(0.975) })
+    let n = pairs.len();
+    let mut draws: Vec<f64> = (0..RESAMPLES).map(|_| over(&mut (0..n).map(|_| &pairs[rng.random_range(0..n)]))).collect();
+    // A draw of groups that all lack the figure says nothing.
+    draws.retain(|v| v.is_finite());
+    draws.sort_by(f64::total_cmp);
+    let at = |q: f64| draws.get(((draws.len().max(1) - 1) as f64 * q).round() as usize).copied().unwrap_or(value);
+    Some(Estimate { value, low: at(0.025), high: at(0.975) })
 }
 
 /// One policy or baseline.
@@ -143,5 +155,14 @@ mod tests {
         let e = mean(&values).unwrap();
         assert!(e.value == 0.5 && (e.low - 0.431).abs() < 0.01 && (e.high - 0.569).abs() < 0.01, "{e:?}");
         assert_eq!(mean(&[1.0, f32::NAN]), None);
+    }
+
+    #[test]
+    fn groups_weigh_by_their_size() {
+        // 1 of 1 and 3 of 9: 4 of 10, between the one and the other.
+        let e = ratio(&[[1.0, 1.0], [3.0, 9.0]]).unwrap();
+        assert!(e.value == 0.4 && e.low == 1.0 / 3.0 && e.high == 1.0, "{e:?}");
+        assert_eq!((ratio(&[]), ratio(&[[0.0, 0.0]])), (None, None));
+        assert_eq!(ratio(&[[0.0, 0.0], [2.0, 4.0]]).map(|e| e.value), Some(0.5));
     }
 }

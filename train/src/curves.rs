@@ -1,5 +1,6 @@
 //! Learning curves as an SVG picture.
 
+use crate::plot::{Area, COLOURS, Drawn, svg};
 use crate::{Error, Result};
 use plotters::prelude::*;
 use std::collections::BTreeMap;
@@ -13,7 +14,6 @@ const PANELS: [(&str, &str, &str, &str); 5] = [
     ("final distance, m", "train/final_dist", "final_dist", "final_dist"),
     ("KL of actions to N(0, I), nats per dimension", "loss/kl_prior", "", ""),
 ];
-const COLOURS: [RGBColor; 4] = [RGBColor(52, 100, 180), RGBColor(214, 116, 40), RGBColor(60, 140, 80), RGBColor(150, 70, 150)];
 const SIZE: (u32, u32) = (1200, 760);
 
 /// The columns of a run's metrics.csv.
@@ -77,23 +77,14 @@ impl Baseline {
 
 /// The picture: a panel per figure; thin lines while training, points in tests (filled: mean action, open: with noise).
 pub fn draw(runs: &[Run], baselines: &[Baseline]) -> Result<String> {
-    let mut svg = String::new();
-    let failed = |e: &dyn std::fmt::Display| Error::run(format!("cannot draw: {e}"));
-    {
-        let root = SVGBackend::with_string(&mut svg, SIZE).into_drawing_area();
-        root.fill(&WHITE).map_err(|e| failed(&e))?;
+    svg(SIZE, |root| {
         let areas = root.split_evenly((2, 3));
         for (area, panel) in areas.iter().zip(PANELS) {
-            draw_panel(area, panel, runs, baselines).map_err(|e| failed(&e))?;
+            draw_panel(area, panel, runs, baselines)?;
         }
-        legend(&areas[5], runs, baselines).map_err(|e| failed(&e))?;
-        root.present().map_err(|e| failed(&e))?;
-    }
-    Ok(svg)
+        legend(&areas[5], runs, baselines)
+    })
 }
-
-type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
-type Drawn<'a> = std::result::Result<(), DrawingAreaErrorKind<<SVGBackend<'a> as DrawingBackend>::ErrorType>>;
 
 fn draw_panel<'a>(area: &Area<'a>, panel: (&str, &str, &str, &str), runs: &[Run], baselines: &[Baseline]) -> Drawn<'a> {
     let (title, training, test, baseline) = panel;

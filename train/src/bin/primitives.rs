@@ -8,8 +8,10 @@ use egogen::motion::{self, MotionSet, MotionWeights, PosePrior};
 use egogen::sim::Sim;
 use egogen_train::primitives::bodies;
 use egogen_train::primitives::eval::{Effort, evaluate};
+use egogen_train::primitives::export::Export;
 use egogen_train::primitives::fit::{Outcome, Run};
 use egogen_train::primitives::pose;
+use egogen_train::primitives::report::Command as Report;
 use egogen_train::primitives::seeds::make_seeds;
 use egogen_train::primitives::settings::Settings;
 use egogen_train::program::{self, Given, INTERRUPTED};
@@ -34,6 +36,10 @@ enum Command {
     Train(Train),
     /// Judge a motion model again and write metrics.json into its folder.
     Eval(Eval),
+    /// Measure a motion model beside recordings: report.json and report.html.
+    Report(Report),
+    /// Write a motion as animated glTF (.glb), in AMASS's layout (.npz) and as a filmstrip (.png).
+    Export(Export),
     /// Train a pose prior (VPoser's form) on the recorded poses, choose its threshold, and judge it.
     Pose(Pose),
     /// Compare a regressor that is told the body's shape with regressors of one body each.
@@ -136,6 +142,8 @@ fn run(command: Command) -> Result<u8> {
             judge(&args.model, &body, &set, &held_out, Effort { people: args.people, episodes: args.episodes })?;
             Ok(0)
         }
+        Command::Report(args) => args.run(),
+        Command::Export(args) => args.run(),
         Command::Pose(args) => train_pose(&args),
         Command::Bodies(args) => compare_bodies(&args),
         Command::Seeds(args) => {

@@ -120,7 +120,11 @@ pub fn held_out_error(predictor: &PredictorWeights, set: &MotionSet) -> Result<[
     Ok([distance(made, &future), distance(&made[last..], &future[last..])])
 }
 
-fn judge_held_out(weights: &MotionWeights, body: &ShapedBody, set: &MotionSet) -> Result<HeldOut> {
+/// Reconstruction of all windows of `set`, one each 5 frames.
+///
+/// # Errors
+/// If no clip holds a window.
+pub fn judge_held_out(weights: &MotionWeights, body: &ShapedBody, set: &MotionSet) -> Result<HeldOut> {
     let (n, seed, future) = windows_of(set)?;
     let ready = Ready::new(&weights.predictor)?;
     let mut tape = Tape::default();

@@ -2,7 +2,8 @@
 
 use super::sample::normals;
 use egogen::body::{BETAS, Frame, MARKER_DIM, PARAMS, ShapedBody, joint};
-use egogen::metrics::{contact_score, foot_heights, rigid_marker_error, stance_slide};
+use egogen::metrics::{Collapse, collapse, contact_score, foot_heights, rigid_marker_error, stance_slide};
+use egogen::motion::primitive::JOINT_DIM;
 use egogen::motion::{FPS, FRAMES, FUTURE, LATENT, MotionSet, SEED};
 use egogen::rng::stream;
 use egogen::sim::{People, Primitives, SeedMotion, Sim};
@@ -39,29 +40,45 @@ pub struct Drift {
     pub regression: f32,
     /// Height of the pelvis, m: mean and standard deviation over people.
     pub pelvis: [f32; 2],
+    /// Share of people who are collapsed, see [`collapse`].
+    pub collapsed: f32,
 }
 
 /// Primitives of a roll-out, and those after which it is looked at.
 const ROLLOUT: usize = 20;
 const LOOK: [usize; 4] = [1, 5, 11, 20];
 
-/// The two frames from `start` on as a seed.
-fn seed_motion(set: &MotionSet, clip: usize, start: usize) -> SeedMotion {
-    SeedMotion { params: set.clips[clip].params[start * PARAMS..(start + SEED) * PARAMS].to_vec(), betas: [0.0; BETAS] }
-}
-
-/// `n` people at the origin who start as recorded somewhere in `set`.
-pub fn start_people(sim: &Sim, set: &MotionSet, n: usize, purpose: &str) -> Result<People> {
+/// `n` beginnings recorded somewhere in `set`, all equally likely, in the world of their clips.
+pub fn draw_starts(set: &MotionSet, n: usize, seed: u64, purpose: &str) -> Result<Vec<SeedMotion>> {
     let windows = set.windows(SEED, 1);
     if windows.is_empty() {
         return Err(Error::invalid("the motion set is empty"));
     }
-    let mut people = People::new(n);
-    for i in 0..n {
-        let (clip, start) = windows[stream(0, purpose, i as u64).random_range(0..windows.len())];
-        people.place(i, sim.body(), &seed_motion(set, clip, start), 0.0, 0.0, 0.0)?;
+    let draw = |i: usize| {
+        let (clip, start) = windows[stream(seed, purpose, i as u64).random_range(0..windows.len())];
+        SeedMotion { params: set.clips[clip].params[start * PARAMS..(start + SEED) * PARAMS].to_vec(), betas: [0.0; BETAS] }
+    };
+    Ok((0..n).map(draw).collect())
+}
+
+/// People at the origin who face along y and start with `starts`.
+pub fn place_people(sim: &Sim, starts: &[SeedMotion]) -> Result<People> {
+    let mut people = People::new(starts.len());
+    for (i, start) in starts.iter().enumerate() {
+        people.place(i, sim.body(), start, 0.0, 0.0, 0.0)?;
     }
     Ok(people)
+}
+
+/// `n` people at the origin who start as recorded somewhere in `set`.
+pub fn start_people(sim: &Sim, set: &MotionSet, n: usize, purpose: &str) -> Result<People> {
+    place_people(sim, &draw_starts(set, n, 0, purpose)?)
+}
+
+/// Planar displacement (right, ahead, metres) and turn (degrees, to the left positive) from one canonical frame to another.
+pub fn displacement(from: &Frame, to: &Frame) -> [f32; 3] {
+    let end = from.inverse().compose(to);
+    [end.transl.x, end.transl.y, end.rot.x_axis.y.atan2(end.rot.x_axis.x).to_degrees()]
 }
 
 /// Feet, speeds and turns of primitives of 20 frames.
@@ -75,13 +92,13 @@ struct GaitSums {
 }
 
 impl GaitSums {
-    /// `markers`: 20 x 201, canonical at the first frame; `end`: canonical frame of frame 18 in the first's.
-    fn add(&mut self, markers: &[f32], end: &Frame) {
+    /// `markers`: 20 x 201, canonical at the first frame; `way`: the [`displacement`] of frame 18 from the first.
+    fn add(&mut self, markers: &[f32], way: [f32; 3]) {
         self.contact.push(contact_score(markers));
         self.slide.push(100.0 * stance_slide(markers));
         self.foot.extend(foot_heights(&markers[markers.len() - MARKER_DIM..]).map(|z| 100.0 * z));
-        self.speed.push(end.transl.y * FPS / FUTURE as f32);
-        self.yaw.push(end.rot.x_axis.y.atan2(end.rot.x_axis.x).to_degrees());
+        self.speed.push(way[1] * FPS / FUTURE as f32);
+        self.yaw.push(way[2]);
     }
 
     fn finish(mut self) -> Gait {
@@ -107,7 +124,7 @@ pub fn data_gait(set: &MotionSet) -> Result<Gait> {
     let mut window = vec![0.0; FRAMES * MARKER_DIM];
     for (clip, start) in set.windows(FRAMES, FUTURE) {
         set.canonical_window(clip, start, FRAMES, &mut window);
-        sums.add(&window, &set.frame(clip, start).inverse().compose(&set.frame(clip, start + FUTURE)));
+        sums.add(&window, displacement(&set.frame(clip, start), &set.frame(clip, start + FUTURE)));
     }
     Ok(sums.finish())
 }
@@ -121,32 +138,62 @@ pub fn roll_out(sim: &Sim, body: &ShapedBody, set: &MotionSet, n: usize) -> Resu
         let z = normals(&mut stream(0, "roll-out latents", k as u64), n * LATENT);
         sim.step(&mut people, &z, &mut out)?;
         for i in 0..n {
-            let end = out.frames[i].inverse().compose(&people.frames[i]);
-            sums.add(&out.markers[i * FRAMES * MARKER_DIM..(i + 1) * FRAMES * MARKER_DIM], &end);
+            let way = displacement(&out.frames[i], &people.frames[i]);
+            sums.add(&out.markers[i * FRAMES * MARKER_DIM..(i + 1) * FRAMES * MARKER_DIM], way);
         }
         if LOOK.contains(&k) {
-            drift.push(look(&out, body, k));
+            let states: Vec<State> = (0..n).map(|i| State::of(&out, i, body)).collect();
+            drift.push(Drift::of(k, &states));
         }
     }
     Ok((sums.finish(), drift))
 }
 
-/// The last frames of a primitive.
-fn look(out: &Primitives, body: &ShapedBody, primitive: usize) -> Drift {
-    let last =
-        |a: &[f32], width: usize| -> Vec<f32> { a.chunks_exact(FRAMES * width).flat_map(|p| p[(FRAMES - 1) * width..].to_vec()).collect() };
-    let markers = last(&out.markers, MARKER_DIM);
-    let joints = last(&out.joints, out.joints.len() / out.frames.len() / FRAMES);
-    let mut skinned = vec![0.0; markers.len()];
-    body.markers_batch(&last(&out.params, PARAMS), &mut skinned);
-    let width = joints.len() / out.frames.len();
-    Drift {
-        primitive,
-        foot: spread(foot_heights(&markers).map(|z| 100.0 * z)),
-        shape: 1000.0 * rigid_marker_error(&markers, body),
-        // The markers are half predicted, half skinned.
-        regression: 2.0 * distance(&markers, &skinned),
-        pelvis: spread(joints.chunks_exact(width).map(|j| j[3 * joint::PELVIS + 2])),
+/// One person at the end of a primitive.
+#[derive(Clone, Copy, Debug)]
+pub struct State {
+    /// Lowest foot marker, cm.
+    pub foot: f32,
+    /// Error of distances between markers of one bone, mm.
+    pub shape: f32,
+    /// Predicted against skinned markers, mm.
+    pub regression: f32,
+    /// Height of the pelvis, m.
+    pub pelvis: f32,
+    pub collapse: Option<Collapse>,
+}
+
+impl State {
+    /// Person `i` in the last frame of `out`, of the shape of `body`.
+    pub fn of(out: &Primitives, i: usize, body: &ShapedBody) -> Self {
+        let frame = i * FRAMES + FRAMES - 1;
+        let markers = &out.markers[frame * MARKER_DIM..][..MARKER_DIM];
+        let joints = &out.joints[frame * JOINT_DIM..][..JOINT_DIM];
+        let mut skinned = [0.0; MARKER_DIM];
+        body.markers(&body.pose(&out.params[frame * PARAMS..][..PARAMS]), &mut skinned);
+        Self {
+            foot: 100.0 * foot_heights(markers).fold(f32::INFINITY, f32::min),
+            shape: 1000.0 * rigid_marker_error(markers, body),
+            // The markers are half predicted, half skinned.
+            regression: 2.0 * distance(markers, &skinned),
+            pelvis: joints[3 * joint::PELVIS + 2],
+            collapse: collapse(markers, joints, body),
+        }
+    }
+}
+
+impl Drift {
+    /// What `states` of all people amount to after `primitive` primitives.
+    pub fn of(primitive: usize, states: &[State]) -> Self {
+        let of = |value: fn(&State) -> f32| states.iter().map(value);
+        Self {
+            primitive,
+            foot: spread(of(|s| s.foot)),
+            shape: mean(of(|s| s.shape)),
+            regression: mean(of(|s| s.regression)),
+            pelvis: spread(of(|s| s.pelvis)),
+            collapsed: mean(of(|s| f32::from(u8::from(s.collapse.is_some())))),
+        }
     }
 }
 

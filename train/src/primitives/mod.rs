@@ -3,6 +3,7 @@
 pub mod adam;
 pub mod bodies;
 pub mod eval;
+pub mod export;
 pub mod fit;
 pub mod gait;
 pub mod init;
@@ -12,6 +13,8 @@ pub mod pose;
 pub mod predictor;
 pub mod progress;
 pub mod regressor;
+pub mod report;
 pub mod sample;
 pub mod seeds;
 pub mod settings;
+pub mod steer;

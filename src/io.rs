@@ -1,5 +1,8 @@
 //! Files: atomic writes, content hashes and checked reading of safetensors.
 
+pub(crate) mod numpy;
+pub(crate) mod zip;
+
 use crate::{Error, Result};
 use half::f16;
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};

@@ -1,9 +1,11 @@
 //! The parametric body: skeleton, shape, skinning, markers and eyes, in parameters of SMPL-X's layout.
 
+mod extra;
 mod frame;
 mod model;
 pub mod rotation;
 mod shaped;
+pub(crate) mod smplx;
 
 pub use frame::{Frame, canonical_frame};
 pub use model::BodyModel;

@@ -1,25 +1,87 @@
 //! The body asset: mesh, shape space, skinning weights and landmarks.
 
-use super::shaped::{Posed, ShapedBody, Skin};
+use super::extra::{Extra, correct};
+use super::shaped::{Posed, ShapedBody};
+use super::smplx;
 use super::{BETAS, JOINTS, MARKERS, PARENTS};
-use crate::io::Tensors;
+use crate::io::{Tensors, write_atomic};
 use crate::{Error, Result};
-use glam::Vec3;
+use glam::{Mat3, Vec3};
+use rayon::prelude::*;
 use std::path::Path;
 use std::sync::{Arc, LazyLock};
 
-/// Bones that move one vertex.
+/// Names of the body asset in a motion-model folder.
+const FILES: [&str; 2] = ["body.npz", "body.safetensors"];
+/// Bones of a vertex in this project's own asset, and for formats that hold that many.
 pub(super) const BONES: usize = 4;
 
-/// A loaded body asset. Lengths in metres, in the rest frame of SMPL-X (x left, y up, z forward), T-pose, the pelvis of the
-/// mean shape at the origin.
+/// The bones that move each vertex and how much each weighs (sum 1): joints, and behind them the bones of [`Extra`].
+#[derive(Clone, Debug, Default)]
+pub(super) struct Skinning {
+    /// Where each vertex's entries end.
+    ends: Vec<usize>,
+    entries: Vec<(usize, f32)>,
+}
+
+impl Skinning {
+    /// Adds the next vertex.
+    pub fn push(&mut self, entries: impl IntoIterator<Item = (usize, f32)>) {
+        self.entries.extend(entries);
+        self.ends.push(self.entries.len());
+    }
+
+    /// Bones and weights of vertex `i`.
+    pub fn of(&self, i: usize) -> &[(usize, f32)] {
+        let start = if i == 0 { 0 } else { self.ends[i - 1] };
+        &self.entries[start..self.ends[i]]
+    }
+
+    /// Weights of vertex `i` by joint, bones counted to the joint that carries them; `carriers`: [`Extra::parents`].
+    fn by_joint(&self, i: usize, carriers: &[usize]) -> [f32; JOINTS] {
+        let mut weights = [0.0; JOINTS];
+        for &(mut bone, weight) in self.of(i) {
+            while let Some(extra) = bone.checked_sub(JOINTS) {
+                bone = carriers[extra];
+            }
+            weights[bone] += weight;
+        }
+        weights
+    }
+
+    /// The joint that weighs most on each vertex.
+    pub fn parts(&self, carriers: &[usize]) -> Vec<u8> {
+        let top = |w: [f32; JOINTS]| (1..JOINTS).fold(0, |top, k| if w[k] > w[top] { k } else { top }) as u8;
+        (0..self.ends.len()).map(|i| top(self.by_joint(i, carriers))).collect()
+    }
+
+    /// The joints that weigh most on vertex `i`, weights with sum 1; of a vertex with few bones all as they are.
+    fn strongest(&self, i: usize, carriers: &[usize]) -> ([usize; BONES], [f32; BONES]) {
+        let own = self.of(i);
+        let mut entries = own.to_vec();
+        if own.len() > BONES || own.iter().any(|e| e.0 >= JOINTS) {
+            entries = self.by_joint(i, carriers).into_iter().enumerate().filter(|e| e.1 > 0.0).collect();
+            entries.sort_by(|a, b| b.1.total_cmp(&a.1));
+            entries.truncate(BONES);
+            let sum: f32 = entries.iter().map(|e| e.1).sum();
+            entries.iter_mut().for_each(|e| e.1 /= sum);
+        }
+        entries.resize(BONES, (0, 0.0));
+        (std::array::from_fn(|b| entries[b].0), std::array::from_fn(|b| entries[b].1))
+    }
+}
+
+/// A loaded body asset. Lengths in metres, in the rest frame of SMPL-X (x left, y up, z forward), T-pose; the shipped one has the pelvis of
+/// the mean shape at the origin.
 pub struct BodyModel {
     pub(super) template: Vec<Vec3>,
     /// V x 10 displacements per unit of each shape coefficient.
     pub(super) shapedirs: Vec<[Vec3; BETAS]>,
     pub(super) joints: [Vec3; JOINTS],
     pub(super) joint_dirs: [[Vec3; BETAS]; JOINTS],
-    pub(super) skin: Vec<Skin>,
+    pub(super) skin: Skinning,
+    /// What only SMPL-X has.
+    pub(super) extra: Option<Arc<Extra>>,
     pub(super) faces: Vec<[u32; 3]>,
     pub(super) uv: Vec<[f32; 2]>,
     pub(super) uv_faces: Vec<[u32; 3]>,
@@ -30,9 +92,14 @@ pub struct BodyModel {
 }
 
 impl BodyModel {
-    /// Reads a body asset from the file `path`. Errors name the tensor and the entry that is not as it should be.
+    /// Reads a body asset from the file `path`: safetensors, or SMPL-X's own model file (`.npz`). Errors name the tensor and the entry that
+    /// is not as it should be.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
-        Self::from_tensors(&Tensors::read(path)?)
+        let path = path.as_ref();
+        if !is_npz(path) {
+            return Self::from_tensors(&Tensors::read(path)?);
+        }
+        smplx::parse(path, &std::fs::read(path).map_err(|e| Error::io(path, e))?, &smplx::SSM2)
     }
 
     /// Reads a body asset from the content of a file; `origin` names it in errors.
@@ -47,6 +114,20 @@ impl BodyModel {
             Arc::new(BodyModel::from_bytes("checkpoints/body/body.safetensors", bytes).expect("the shipped asset is checked by a test"))
         });
         BODY.clone()
+    }
+
+    /// The body of the motion-model folder `dir`: the asset that lies in it, else the shipped one.
+    pub fn beside(dir: impl AsRef<Path>) -> Result<Arc<Self>> {
+        match FILES.iter().map(|name| dir.as_ref().join(name)).find(|path| path.exists()) {
+            Some(path) => Ok(Arc::new(Self::load(path)?)),
+            None => Ok(Self::embedded()),
+        }
+    }
+
+    /// Copies the body asset at `path` into the motion-model folder `dir`, where [`BodyModel::beside`] finds it.
+    pub fn put_beside(path: &Path, dir: &Path) -> Result<()> {
+        let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
+        write_atomic(dir.join(FILES[usize::from(!is_npz(path))]), &bytes)
     }
 
     fn from_tensors(t: &Tensors) -> Result<Self> {
@@ -66,6 +147,7 @@ impl BodyModel {
             joints: array(&vec3s(&t.f32s("joints_template", &[JOINTS, 3])?)),
             joint_dirs: array(&joint_dirs),
             skin: skin(t, v)?,
+            extra: None,
             faces: triangles(&t.indices("faces", &[0, 3], v)?),
             uv_faces: triangles(&t.indices("uv_faces", &[0, 3], uv.len())?),
             uv,
@@ -112,9 +194,11 @@ impl BodyModel {
         &self.markers
     }
 
-    /// The four bones of each vertex and their weights, which sum to 1.
+    /// The four joints that weigh most on each vertex and their weights, which sum to 1; fingers count to the wrist. For formats that hold
+    /// no more; the body itself moves by all its bones.
     pub fn skinning(&self) -> impl ExactSizeIterator<Item = ([usize; BONES], [f32; BONES])> + '_ {
-        self.skin.iter().map(|s| (s.bone, s.weight))
+        let carriers = self.extra.as_ref().map_or(&[][..], |e| &e.parents);
+        (0..self.template.len()).map(|i| self.skin.strongest(i, carriers))
     }
 
     /// Rest joints of the mean shape.
@@ -143,17 +227,19 @@ impl BodyModel {
         out.extend((0..self.template.len()).map(|i| self.rest_vertex(i, betas)));
     }
 
-    /// All V vertices of `body` posed by `posed` into `out`, by linear blend skinning.
+    /// All V vertices of `body` posed by `posed` into `out`, by linear blend skinning of the vertices at rest, corrected by the pose where
+    /// the asset says how.
     pub fn skin(&self, body: &ShapedBody, posed: &Posed, out: &mut Vec<Vec3>) {
         out.clear();
         // x_k - R_k J_k, so that each bone costs one product and one sum.
-        let shift: [Vec3; JOINTS] = std::array::from_fn(|k| posed.pos[k] - posed.rot[k] * body.joints[k]);
-        out.extend(self.skin.iter().enumerate().map(|(i, s)| {
-            let v = self.rest_vertex(i, &body.betas);
-            (0..BONES).fold(Vec3::ZERO, |sum, b| {
-                let k = s.bone[b];
-                sum + s.weight[b] * (posed.rot[k] * v + shift[k])
-            })
+        let bones: Vec<(Mat3, Vec3)> = posed.bones().zip(body.rest_bones()).map(|((rot, pos), j)| (rot, pos - rot * j)).collect();
+        out.par_extend((0..self.template.len()).into_par_iter().map(|i| {
+            let mut v = self.rest_vertex(i, &body.betas);
+            if let Some(extra) = &self.extra {
+                let n = extra.columns();
+                v += correct(&extra.correctives[i * n..(i + 1) * n], &posed.extra.feature);
+            }
+            self.skin.of(i).iter().fold(Vec3::ZERO, |sum, &(k, weight)| sum + weight * (bones[k].0 * v + bones[k].1))
         }));
     }
 
@@ -167,21 +253,23 @@ pub(super) fn blend(mean: Vec3, dirs: &[Vec3; BETAS], betas: &[f32]) -> Vec3 {
     dirs.iter().zip(betas).fold(mean, |v, (&d, &b)| v + b * d)
 }
 
-fn skin(t: &Tensors, v: usize) -> Result<Vec<Skin>> {
+fn is_npz(path: &Path) -> bool {
+    path.extension().is_some_and(|e| e == "npz")
+}
+
+fn skin(t: &Tensors, v: usize) -> Result<Skinning> {
     let bone = t.indices("skin_index", &[v, BONES], JOINTS)?;
     let weight = t.f32s("skin_weight", &[v, BONES])?;
-    let pairs = bone.as_chunks::<BONES>().0.iter().zip(weight.as_chunks::<BONES>().0);
-    pairs
-        .enumerate()
-        .map(|(i, (&bone, weight))| {
-            let sum: f32 = weight.iter().sum();
-            if weight.iter().any(|&w| w < 0.0) || (sum - 1.0).abs() > 0.01 {
-                let what = format!("tensor 'skin_weight' row {i} is {weight:?}, expected weights of at least 0 with sum 1");
-                return Err(Error::file(t.origin(), what));
-            }
-            Ok(Skin { bone, weight: weight.map(|w| w / sum) })
-        })
-        .collect()
+    let mut skin = Skinning::default();
+    for (i, (bone, weight)) in bone.as_chunks::<BONES>().0.iter().zip(weight.as_chunks::<BONES>().0).enumerate() {
+        let sum: f32 = weight.iter().sum();
+        if weight.iter().any(|&w| w < 0.0) || (sum - 1.0).abs() > 0.01 {
+            let what = format!("tensor 'skin_weight' row {i} is {weight:?}, expected weights of at least 0 with sum 1");
+            return Err(Error::file(t.origin(), what));
+        }
+        skin.push(bone.iter().zip(weight).map(|(&b, w)| (b, w / sum)));
+    }
+    Ok(skin)
 }
 
 fn vec3s(data: &[f32]) -> Vec<Vec3> {

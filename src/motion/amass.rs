@@ -1,9 +1,9 @@
 //! AMASS recordings: `.npz` archives of SMPL-X (`*_stageii.npz`, read and written) and SMPL-H (read).
 
 use super::FPS;
-use super::numpy::{Npz, NpzWriter};
 use super::poses::{PoseClip, Recording, Up};
 use crate::body::{HANDS, ORIENT, PARAMS, TRANSL, check_motion};
+use crate::io::numpy::{Npz, NpzWriter};
 use crate::io::write_atomic;
 use crate::{Error, Result};
 use std::fs;

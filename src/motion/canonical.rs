@@ -1,11 +1,11 @@
 //! EgoGen's files of one canonical primitive each, `.npz`.
 
 use super::clip::Pose;
-use super::numpy::{Array, Npz, NpzWriter};
 use super::poses::{PoseClip, Recording, Up};
 use super::primitive::{JOINT_DIM, MotionSet};
 use super::{FPS, FRAMES};
 use crate::body::{BETAS, BODY_JOINTS, Frame, MARKER_DIM, MARKERS, PARAMS, ShapedBody, TRANSL};
+use crate::io::numpy::{Array, Npz, NpzWriter};
 use crate::io::write_atomic;
 use crate::{Error, Result};
 use glam::{Mat3, Quat, Vec3};
@@ -148,8 +148,8 @@ impl CanonicalPrimitive {
 mod tests {
     use super::*;
     use crate::body::BodyModel;
+    use crate::io::zip::Archive;
     use crate::motion::clip::{Clip, SIDES, Skeleton, upright};
-    use crate::motion::zip::Archive;
 
     fn fixture() -> std::path::PathBuf {
         Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/importers/canonical.npz")

@@ -6,9 +6,11 @@ use super::bvh::{Bvh, parse_bvh};
 use super::canonical::CanonicalPrimitive;
 use super::cmu::parse_expmap;
 use super::named::parse_named;
-use super::numpy::{Array, Npz, parse_npy};
 use super::samp::parse_samp;
-use super::zip::{Archive, pack};
+use crate::body::smplx::parse;
+use crate::body::tests::few_vertices;
+use crate::io::numpy::{Array, Npz, parse_npy};
+use crate::io::zip::{Archive, pack};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use std::path::Path;
@@ -101,6 +103,22 @@ proptest! {
             let entry = &mut entries[which % archive.names().count()].1;
             *entry = damaged(std::mem::take(entry), &changes);
             read_npz(&pack(&entries));
+        }
+    }
+
+    /// Damage within entries of a body, whose markers are among the few vertices.
+    #[test]
+    fn damaged_bodies(changes in damage(), which in 0..12usize) {
+        let (bytes, markers) = few_vertices();
+        let archive = Archive::new(&bytes).unwrap();
+        let names: Vec<String> = archive.names().map(String::from).collect();
+        let mut entries: Vec<(String, Vec<u8>)> = names.into_iter().map(|n| (n.clone(), archive.read(&n).unwrap())).collect();
+        let at = which % entries.len();
+        entries[at].1 = damaged(std::mem::take(&mut entries[at].1), &changes);
+        for bytes in [pack(&entries), damaged(bytes.clone(), &changes)] {
+            if let Err(error) = parse(Path::new("damaged.npz"), &bytes, &markers) {
+                prop_assert!(error.to_string().contains("damaged.npz"), "{error}");
+            }
         }
     }
 

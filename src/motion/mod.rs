@@ -18,7 +18,6 @@ mod layers;
 mod mend;
 mod named;
 mod net;
-mod numpy;
 mod pickle;
 pub mod pose_prior;
 pub mod poses;
@@ -29,7 +28,6 @@ pub mod resample;
 pub mod retarget;
 pub mod samp;
 mod weights;
-mod zip;
 
 pub use dataset::{BuildReport, build};
 pub use import::{ImportOptions, Recorded, import};

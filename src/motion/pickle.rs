@@ -4,7 +4,7 @@
 //! `dtype`, and `_codecs.encode`, by which protocol 2 stores bytes) are recognised as data; every other name and every opcode that NumPy
 //! does not need is refused by name. Values live in one list and refer to each other by index, and bytes stay in the file.
 
-use super::numpy::{Array, Dtype};
+use crate::io::numpy::{Array, Dtype};
 use crate::{Error, Result};
 use std::borrow::Cow;
 use std::collections::HashMap;

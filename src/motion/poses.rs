@@ -1,10 +1,10 @@
 //! Recordings that hold the rotations of SMPL-X's body joints, and how they come onto the project's body.
 
 use super::clip::{Clip, Pose, SIDES, Skeleton, quantile, upright};
-use super::numpy::Array;
 use super::resample::{check_fps, resample};
 use super::retarget::{RetargetReport, settle};
 use crate::body::{BODY_JOINTS, PARENTS};
+use crate::io::numpy::Array;
 use crate::{Error, Result};
 use glam::{Quat, Vec3};
 use std::path::Path;

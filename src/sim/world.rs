@@ -34,16 +34,18 @@ impl World {
         const SEEDS: &[u8] = include_bytes!("../../checkpoints/motion/seeds.safetensors");
         let dir = Path::new("checkpoints/motion");
         let [config, predictor, regressor] = MODEL.map(<[u8]>::to_vec);
-        let seeds = SeedBank::from_bytes(dir.join(SEEDS_FILE), SEEDS, &BodyModel::embedded())?;
-        Self::new(dir, &MotionWeights::from_bytes(dir, config, predictor, regressor)?, seeds)
+        let body = BodyModel::embedded();
+        let seeds = SeedBank::from_bytes(dir.join(SEEDS_FILE), SEEDS, &body)?;
+        Self::new(dir, body, &MotionWeights::from_bytes(dir, config, predictor, regressor)?, seeds)
     }
 
-    /// The motion model in the folder `dir` on the shipped body.
+    /// The motion model in the folder `dir` on the body beside it, or on the shipped one; see [`BodyModel::beside`].
     ///
     /// Errors: a missing or damaged file, a motion model or seeds made with another body, fewer than two seeds.
     pub fn load(dir: &Path) -> Result<Self> {
-        let seeds = SeedBank::read(dir.join(SEEDS_FILE), &BodyModel::embedded())?;
-        Self::new(dir, &MotionWeights::load(dir)?, seeds)
+        let body = BodyModel::beside(dir)?;
+        let seeds = SeedBank::read(dir.join(SEEDS_FILE), &body)?;
+        Self::new(dir, body, &MotionWeights::load(dir)?, seeds)
     }
 
     /// Content hashes of the body and the motion model: what a policy trained here stands on.
@@ -52,9 +54,13 @@ impl World {
         hashes.into_iter().map(|(name, hash)| (name.to_string(), hash.to_string())).collect()
     }
 
-    /// People with the shipped body, moved by `weights` from the folder `dir`; refused when they were made with another body.
+    /// People with the body beside the motion model in the folder `dir`, or the shipped one, moved by `weights` of that folder; refused when
+    /// they were made with another body.
     pub fn simulation(dir: &Path, weights: &MotionWeights) -> Result<Arc<Sim>> {
-        let body = BodyModel::embedded();
+        Self::simulate(dir, BodyModel::beside(dir)?, weights)
+    }
+
+    fn simulate(dir: &Path, body: Arc<BodyModel>, weights: &MotionWeights) -> Result<Arc<Sim>> {
         if weights.config.body != body.hash() {
             let what = format!("body is '{}', but the body here is '{}'; train the motion model on it", weights.config.body, body.hash());
             return Err(Error::file(dir.join(CONFIG_FILE), what));
@@ -62,8 +68,8 @@ impl World {
         Ok(Arc::new(Sim::new(body, Arc::new(MotionEngine::new(weights)?))))
     }
 
-    fn new(dir: &Path, weights: &MotionWeights, seeds: SeedBank) -> Result<Self> {
-        let sim = Self::simulation(dir, weights)?;
+    fn new(dir: &Path, body: Arc<BodyModel>, weights: &MotionWeights, seeds: SeedBank) -> Result<Self> {
+        let sim = Self::simulate(dir, body, weights)?;
         if seeds.seeds.len() < 2 {
             return Err(Error::file(dir.join(SEEDS_FILE), "holds one seed motion, expected some to train and some to test from"));
         }

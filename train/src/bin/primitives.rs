@@ -121,6 +121,9 @@ struct Train {
     /// Change a value of the recipe; may be given several times.
     #[arg(long, value_name = "KEY=VALUE", conflicts_with = "resume")]
     set: Vec<String>,
+    /// Body to train on, an asset or SMPL-X's own .npz, copied into --out; the shipped one when left out.
+    #[arg(long, value_name = "FILE", conflicts_with = "resume")]
+    body: Option<PathBuf>,
     /// Start with the networks of this motion-model folder.
     #[arg(long, value_name = "DIR", conflicts_with = "resume")]
     start_from: Option<PathBuf>,
@@ -137,7 +140,7 @@ fn run(command: Command) -> Result<u8> {
     match command {
         Command::Train(args) => train(args),
         Command::Eval(args) => {
-            let body = BodyModel::embedded();
+            let body = BodyModel::beside(&args.model).given()?;
             let (set, held_out, _) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
             judge(&args.model, &body, &set, &held_out, Effort { people: args.people, episodes: args.episodes })?;
             Ok(0)
@@ -147,7 +150,7 @@ fn run(command: Command) -> Result<u8> {
         Command::Pose(args) => train_pose(&args),
         Command::Bodies(args) => compare_bodies(&args),
         Command::Seeds(args) => {
-            let body = BodyModel::embedded();
+            let body = BodyModel::beside(&args.model).given()?;
             let (set, ..) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
             write_seeds(&args.model, &body, &set)?;
             Ok(0)
@@ -175,8 +178,14 @@ fn write_seeds(model: &Path, body: &Arc<BodyModel>, set: &MotionSet) -> Result<(
 
 fn train(args: Train) -> Result<u8> {
     let settings = Settings::load(&args.recipe, &args.set)?;
-    let body = BodyModel::embedded();
+    let body = match &args.body {
+        Some(path) => Arc::new(BodyModel::load(path).given()?),
+        None => BodyModel::beside(&args.out).given()?,
+    };
     let (set, held_out, report) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
+    if let Some(path) = &args.body {
+        BodyModel::put_beside(path, &args.out).given()?;
+    }
     eprintln!("{report}");
     let mut run = if args.resume {
         Run::resume(&set, &held_out, &body, &args.out).given()?

@@ -40,7 +40,7 @@ pub struct Command {
 impl Command {
     /// Writes report.json and report.html, and prints the figures.
     pub fn run(&self) -> Result<u8> {
-        let body = BodyModel::embedded();
+        let body = BodyModel::beside(&self.model).given()?;
         let weights = MotionWeights::load(&self.model).given()?;
         let sim = World::simulation(&self.model, &weights).given()?;
         let (mut data, mut bank) = (None, None);

@@ -9,7 +9,7 @@ const MAGIC: &[u8] = b"\x93NUMPY";
 
 /// Type of an array's elements, as NumPy writes it: order `<`, `>`, `|` or `=`, kind, and size in bytes (of `U` in characters).
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Dtype {
+pub(crate) struct Dtype {
     pub big: bool,
     pub kind: u8,
     pub size: usize,
@@ -17,7 +17,7 @@ pub(super) struct Dtype {
 
 /// Numbers with their shape, in C order.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Array {
+pub(crate) struct Array {
     pub shape: Vec<usize>,
     pub data: Vec<f32>,
 }
@@ -147,7 +147,7 @@ fn show(shape: &[usize]) -> String {
 type Npy<'a> = (Dtype, Vec<usize>, bool, &'a [u8]);
 
 /// Takes `.npy` data apart.
-pub(super) fn parse_npy(bytes: &[u8]) -> std::result::Result<Npy<'_>, String> {
+pub(crate) fn parse_npy(bytes: &[u8]) -> std::result::Result<Npy<'_>, String> {
     let cut = || "is cut off within its header".to_string();
     let rest = bytes.strip_prefix(MAGIC).ok_or("is no NumPy array")?;
     let (&[major, _], rest) = rest.split_first_chunk().ok_or_else(cut)?;
@@ -169,7 +169,7 @@ pub(super) fn parse_npy(bytes: &[u8]) -> std::result::Result<Npy<'_>, String> {
 }
 
 /// An `.npz` archive; entries are read when asked for, so that others may hold anything.
-pub(super) struct Npz<'a> {
+pub(crate) struct Npz<'a> {
     path: PathBuf,
     zip: Archive<'a>,
 }
@@ -217,7 +217,7 @@ impl<'a> Npz<'a> {
 
 /// Collects arrays for an `.npz` archive, which NumPy reads; the same arrays give the same bytes.
 #[derive(Default)]
-pub(super) struct NpzWriter(Vec<(String, Vec<u8>)>);
+pub(crate) struct NpzWriter(Vec<(String, Vec<u8>)>);
 
 impl NpzWriter {
     /// Adds numbers in C order as single precision.

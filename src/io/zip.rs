@@ -27,7 +27,7 @@ struct Entry {
 }
 
 /// An archive in memory. Errors say what is wrong with it.
-pub(super) struct Archive<'a> {
+pub(crate) struct Archive<'a> {
     bytes: &'a [u8],
     entries: Vec<Entry>,
 }
@@ -113,7 +113,7 @@ fn crc(bytes: &[u8]) -> u32 {
 }
 
 /// An archive of stored entries, each a name and its content, below 4 GiB in all.
-pub(super) fn pack(entries: &[(String, Vec<u8>)]) -> Vec<u8> {
+pub(crate) fn pack(entries: &[(String, Vec<u8>)]) -> Vec<u8> {
     let (mut out, mut directory) = (Vec::new(), Vec::new());
     for (name, content) in entries {
         let offset = out.len() as u32;

@@ -1,6 +1,7 @@
 //! Files: atomic writes, content hashes and checked reading of safetensors.
 
 pub(crate) mod numpy;
+pub(crate) mod pickle;
 pub(crate) mod zip;
 
 use crate::{Error, Result};

@@ -16,6 +16,7 @@ pub mod rng;
 pub mod scene;
 pub mod sensing;
 pub mod sim;
+pub mod torch;
 
 pub use device::DeviceChoice;
 

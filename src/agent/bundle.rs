@@ -1,5 +1,5 @@
 //! The exported policy: a folder with `policy.json` and `policy.safetensors` (half precision, or single
-//! where the policy normalises observations).
+//! where the policy normalises observations or was brought from elsewhere).
 //!
 //! The JSON names the observation layout, the sizes, the log-variance clamp, the hashes of what the policy stands on (motion model,
 //! body) and a golden pair: one observation and what the network says of it, computed again whenever the bundle is read.
@@ -88,6 +88,17 @@ impl Bundle {
     pub fn new(spec: PolicySpec, params: &[f32], origin: BTreeMap<String, String>, trained: Trained) -> Result<Self> {
         // Means of observations may be far larger than their standard deviations.
         let precision = if spec.obs_norm.is_some() { Precision::Full } else { Precision::Half };
+        Self::with_precision(spec, params, origin, trained, precision)
+    }
+
+    /// Packs a policy with its parameters in that precision.
+    pub fn with_precision(
+        spec: PolicySpec,
+        params: &[f32],
+        origin: BTreeMap<String, String>,
+        trained: Trained,
+        precision: Precision,
+    ) -> Result<Self> {
         let bytes = pack_tensors(&spec.to_tensors(params), &BTreeMap::new(), precision)?;
         let params = spec.from_tensors(&Tensors::from_bytes(WEIGHTS, bytes.clone())?)?;
         Ok(Self { spec: Arc::new(spec), params, origin, trained, bytes })

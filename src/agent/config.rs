@@ -126,6 +126,26 @@ pub struct PolicyConfig {
     pub actor_scale: ActorScale,
 }
 
+impl Default for PolicyConfig {
+    /// What a recipe without any of the keys gives.
+    fn default() -> Self {
+        Self {
+            gru: BTreeMap::new(),
+            octaves: default_octaves(),
+            trunk: None,
+            blocks: default_blocks(),
+            hidden: Vec::new(),
+            activation: Nonlinearity::default(),
+            shared: false,
+            log_std: None,
+            state_noise: None,
+            obs_norm: false,
+            logvar: default_logvar(),
+            actor_scale: ActorScale::default(),
+        }
+    }
+}
+
 fn default_octaves() -> usize {
     12
 }

@@ -1,6 +1,7 @@
 //! How a policy sees and acts: observation layout, network, action distribution.
 
 mod action;
+pub mod authors;
 pub mod bundle;
 mod categorical;
 mod config;

@@ -6,7 +6,7 @@ use super::{Activation, GruCell, Linear, Source, View};
 use crate::Result;
 use crate::body::rotation::{from_6d, to_axis_angle};
 use crate::body::{BETAS, BODY_JOINTS, HANDS, MARKER_DIM, ORIENT, PARAMS, POSE, TRANSL};
-use crate::motion::{CONTINUOUS, Dense, FUTURE, MotionModel, MotionWeights, PredictorWeights, RegressorWeights, SEED};
+use crate::motion::{CONTINUOUS, Dense, FUTURE, MotionModel, MotionWeights, Origin, PredictorWeights, RegressorWeights, SEED};
 use glam::Vec3;
 use std::ops::Range;
 use std::path::Path;
@@ -201,6 +201,7 @@ pub struct MotionEngine {
     decoder: Decoder,
     regressor: Regressor,
     hash: String,
+    origin: Origin,
 }
 
 impl MotionEngine {
@@ -210,7 +211,8 @@ impl MotionEngine {
     /// If a layer's arrays do not fill its shape.
     pub fn new(weights: &MotionWeights) -> Result<Self> {
         let decoder = Decoder::new(&weights.predictor)?;
-        Ok(Self { decoder, regressor: Regressor::new(&weights.regressor)?, hash: weights.hash.clone() })
+        let regressor = Regressor::new(&weights.regressor)?;
+        Ok(Self { decoder, regressor, hash: weights.hash.clone(), origin: weights.config.canonical })
     }
 
     /// Reads a motion-model folder.
@@ -237,6 +239,10 @@ impl MotionModel for MotionEngine {
 
     fn hash(&self) -> &str {
         &self.hash
+    }
+
+    fn origin(&self) -> Origin {
+        self.origin
     }
 }
 

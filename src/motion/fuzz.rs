@@ -1,12 +1,15 @@
 //! Damaged files: every reader answers with a value or an error, whatever the bytes are.
 
+use super::PosePrior;
 use super::amass::parse_amass;
 use super::asf::{parse_amc, parse_asf};
+use super::authors::{read_predictor, read_regressor};
 use super::bvh::{Bvh, parse_bvh};
 use super::canonical::CanonicalPrimitive;
 use super::cmu::parse_expmap;
 use super::named::parse_named;
 use super::samp::parse_samp;
+use crate::agent::authors::read_policy;
 use crate::body::smplx::parse;
 use crate::body::tests::few_vertices;
 use crate::io::numpy::{Array, Npz, parse_npy};
@@ -106,7 +109,24 @@ proptest! {
         }
     }
 
-    /// Damage within entries of a body, whose markers are among the few vertices.
+    #[test]
+    fn damaged_checkpoints(changes in damage(), which in 0..5usize) {
+        let name = ["vposer_v1.pt", "vposer_v2.ckpt", "predictor.ckp", "regressor.ckp", "policy.pth"][which];
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join(name);
+        std::fs::write(&path, damaged(fixture(&format!("assets/{name}")), &changes)).unwrap();
+        let error = match which {
+            0 | 1 => PosePrior::load(&path).err(),
+            2 => read_predictor(&path).err(),
+            3 => read_regressor(&path).err(),
+            _ => read_policy(&path).err(),
+        };
+        if let Some(error) = error {
+            prop_assert!(error.to_string().contains(name), "{error}");
+        }
+    }
+
+    /// The same of a body; its markers are among the few vertices.
     #[test]
     fn damaged_bodies(changes in damage(), which in 0..12usize) {
         let (bytes, markers) = few_vertices();

@@ -3,6 +3,7 @@
 pub mod amass;
 pub mod asf;
 pub mod augment;
+pub mod authors;
 pub mod bvh;
 pub mod canonical;
 pub mod clean;
@@ -18,7 +19,6 @@ mod layers;
 mod mend;
 mod named;
 mod net;
-mod pickle;
 pub mod pose_prior;
 pub mod poses;
 mod predictor;
@@ -37,8 +37,8 @@ pub use predictor::Predictor;
 pub use primitive::{ClipMarkers, MotionSet};
 pub use regressor::Regressor;
 pub use weights::{
-    CONFIG_FILE, CONTINUOUS, MotionConfig, MotionWeights, PREDICTOR_FILE, PredictorSizes, PredictorWeights, REGRESSOR_FILE, RegressorSizes,
-    RegressorWeights,
+    CONFIG_FILE, CONTINUOUS, MotionConfig, MotionWeights, Origin, PREDICTOR_FILE, PredictorSizes, PredictorWeights, REGRESSOR_FILE,
+    RegressorSizes, RegressorWeights,
 };
 
 use crate::Result;
@@ -67,4 +67,10 @@ pub trait MotionModel: Send + Sync {
 
     /// Content hash of the weights, which a policy trained on this model names.
     fn hash(&self) -> &str;
+
+    /// Where the canonical frames of what [`MotionModel::decode`] and [`MotionModel::regress`] read and write have their origin. The
+    /// simulation's own are above the floor; it lowers and lifts what it exchanges with a model of the other kind.
+    fn origin(&self) -> Origin {
+        Origin::Floor
+    }
 }

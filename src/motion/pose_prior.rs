@@ -1,6 +1,7 @@
 //! A pose prior of VPoser's form: how far a body pose lies from those it has learned (eq. 9).
 //!
-//! Files hold the tensors of VPoser v1 or v2 under their own names; ours have v1's:
+//! Files hold the tensors of VPoser v1 or v2 under their own names, in safetensors or in the checkpoints that are published (v1 `.pt`,
+//! v2 `.ckpt`); ours have v1's:
 //!
 //! | tensor (v1; `.weight`, `.bias`) | v2, after `vp_model.` if there | in -> out | |
 //! |---|---|---|---|
@@ -17,7 +18,7 @@ use super::Dense;
 use crate::body::PARAMS;
 use crate::io::Tensors;
 use crate::kernels::{Activation, Linear, Source, View, ViewMut};
-use crate::{Error, Result};
+use crate::{Error, Result, torch};
 use std::ops::Range;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
@@ -61,12 +62,15 @@ impl PosePrior {
         Ok(SHIPPED.get_or_init(|| prior).clone())
     }
 
-    /// Reads the prior at `path` (safetensors, names as above).
+    /// Reads the prior at `path`: safetensors or a checkpoint of PyTorch, by its extension; names as above.
     ///
     /// # Errors
     /// Names the file and the tensor that is missing or of another shape.
     pub fn load(path: impl AsRef<Path>) -> Result<Self> {
-        Self::from_tensors(&Tensors::read(path)?)
+        const PARTS: [&str; 4] = ["bodyprior_", "vp_model.", "encoder_net.", "decoder_net."];
+        let path = path.as_ref();
+        let wanted = |name: &str| PARTS.iter().any(|p| name.starts_with(p));
+        Self::from_tensors(&if torch::is_checkpoint(path) { torch::read(path, wanted)? } else { Tensors::read(path)? })
     }
 
     /// Takes the tensors of a file; see the module's table.
@@ -209,6 +213,24 @@ mod tests {
                 .for_each(|(p, pose)| p[POSE].copy_from_slice(pose));
             let norm = input("mu", POSE_LATENT)[..POSE_LATENT].iter().map(|v| v * v).sum::<f32>().sqrt();
             assert!((prior.norms(&params)[0] - norm).abs() < 1e-3);
+        }
+    }
+
+    #[test]
+    fn published_files_match_torch() {
+        let file = |name: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/assets").join(name);
+        let t = Tensors::read(file("expected.safetensors")).unwrap();
+        for (version, name) in [("v1", "vposer_v1.pt"), ("v2", "vposer_v2.ckpt")] {
+            let prior = PosePrior::load(file(name)).unwrap();
+            assert_eq!(prior.threshold(), 11.0);
+            let get = |name: &str, width: usize| t.f32s(&format!("{version}.{name}"), &[4, width]).unwrap();
+            for (have, want) in [
+                (prior.encode(&get("poses", POSE_DIM)), get("mu", POSE_LATENT)),
+                (prior.decode(&get("latents", POSE_LATENT)), get("rotations", 2 * POSE_DIM)),
+            ] {
+                let worst = have.iter().zip(&want).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+                assert!(worst < 1e-4, "{name} is off by {worst}");
+            }
         }
     }
 

@@ -1,5 +1,6 @@
 //! Canonical windows of motion: what the motion model trains on.
 
+use super::Origin;
 use super::clip::{Clip, Skeleton};
 use crate::body::{JOINTS, MARKER_DIM, PARAMS, ShapedBody, canonical_frame, joint};
 use glam::Vec3;
@@ -85,8 +86,17 @@ impl MotionSet {
 
     /// Markers of frames `start..start + len`, in the canonical frame of frame `start`, into `out` (len x 201, metres).
     pub fn canonical_window(&self, clip: usize, start: usize, len: usize, out: &mut [f32]) {
+        self.window(Origin::Floor, clip, start, len, out);
+    }
+
+    /// [`MotionSet::canonical_window`] in a canonical frame with that origin.
+    pub fn window(&self, origin: Origin, clip: usize, start: usize, len: usize, out: &mut [f32]) {
         let markers = &self.clips[clip].markers[start * MARKER_DIM..(start + len) * MARKER_DIM];
-        let local = self.frame(clip, start).inverse();
+        let mut frame = self.frame(clip, start);
+        if origin == Origin::Pelvis {
+            frame.transl.z = self.clips[clip].joint(start, joint::PELVIS).z;
+        }
+        let local = frame.inverse();
         for (from, to) in markers.chunks_exact(3).zip(out.chunks_exact_mut(3)) {
             to.copy_from_slice(&local.point(Vec3::from_slice(from)).to_array());
         }
@@ -121,6 +131,8 @@ mod tests {
         for (got, want) in out[..3].iter().chain(&out[MARKER_DIM..MARKER_DIM + 3]).zip([-0.3, 0.2, 1.0, -0.3, 0.3, 1.0]) {
             assert!((got - want).abs() < 1e-6, "{got} for {want}");
         }
+        set().window(Origin::Pelvis, 0, 1, 1, &mut out[..MARKER_DIM]);
+        assert!((out[2] - 0.1).abs() < 1e-6, "the pelvis is 0.9 m up, the markers 1 m");
     }
 
     #[test]

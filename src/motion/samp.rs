@@ -1,7 +1,7 @@
 //! SAMP recordings: Python pickles of SMPL-X poses.
 
-use super::pickle::Pickle;
 use super::poses::{PoseClip, Recording, Up};
+use crate::io::pickle::Pickle;
 use crate::{Error, Result};
 use std::fs;
 use std::path::Path;

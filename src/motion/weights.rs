@@ -58,6 +58,27 @@ pub struct PredictorSizes {
     pub latent: usize,
 }
 
+impl PredictorSizes {
+    /// The sizes of a predictor whose tensors are `t`; [`PredictorWeights::read`] then checks every tensor against them.
+    ///
+    /// # Errors
+    /// Names the tensor that is missing.
+    pub fn of(t: &Tensors) -> Result<Self> {
+        let input = t.shape("x_enc.weight_ih_l0")?;
+        Ok(Self {
+            frame: input.get(1).copied().unwrap_or(0),
+            hidden: input.first().copied().unwrap_or(0) / 3,
+            wide: outputs(t, "e_mlp.layers.0")?,
+            latent: outputs(t, "e_mu")?,
+        })
+    }
+}
+
+/// Outputs of the dense layer `name`.
+fn outputs(t: &Tensors, name: &str) -> Result<usize> {
+    Ok(t.shape(&format!("{name}.bias"))?.first().copied().unwrap_or(0))
+}
+
 impl Default for PredictorSizes {
     fn default() -> Self {
         Self { frame: MARKER_DIM, hidden: 256, wide: 512, latent: super::LATENT }
@@ -85,6 +106,27 @@ impl Default for RegressorSizes {
 impl RegressorSizes {
     /// Floats of the network's input: markers, betas, the current estimate.
     pub const INPUT: usize = MARKER_DIM + BETAS + CONTINUOUS;
+
+    /// The sizes of a regressor whose tensors are `t`; its passes, which no tensor tells, are the authors'.
+    ///
+    /// # Errors
+    /// Names the tensor that is missing.
+    pub fn of(t: &Tensors) -> Result<Self> {
+        let names = t.names();
+        let has = |i: &usize| names.contains(&format!("pnet.layers.{i}.layers.0.weight"));
+        Ok(Self { width: outputs(t, "pnet.in_fc")?, blocks: (0..).take_while(has).count(), ..Self::default() })
+    }
+}
+
+/// Where canonical frames have their origin.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Origin {
+    /// On the floor below the pelvis of the first frame, so that heights are absolute.
+    #[default]
+    Floor,
+    /// At that pelvis itself, as in the authors' code.
+    Pelvis,
 }
 
 /// Content of `motion.json`.
@@ -95,8 +137,8 @@ pub struct MotionConfig {
     pub fps: f32,
     /// Frames of a primitive, seed included; 20.
     pub frames: usize,
-    /// Where the canonical origin lies: "floor" (below the pelvis, heights absolute).
-    pub canonical: String,
+    /// Where the canonical frames that the model has learned have their origin.
+    pub canonical: Origin,
     /// Sizes of the predictor.
     pub predictor: PredictorSizes,
     /// Sizes of the regressor.
@@ -111,7 +153,7 @@ impl MotionConfig {
         Self {
             fps: super::FPS,
             frames: super::FRAMES,
-            canonical: "floor".into(),
+            canonical: Origin::Floor,
             predictor: PredictorSizes::default(),
             regressor: RegressorSizes::default(),
             body: body.into(),
@@ -270,10 +312,21 @@ impl MotionWeights {
 
     /// Writes a motion-model folder, weights in half precision.
     pub fn save(dir: impl AsRef<Path>, config: &MotionConfig, predictor: &PredictorWeights, regressor: &RegressorWeights) -> Result<()> {
+        Self::save_as(dir, config, predictor, regressor, Precision::Half)
+    }
+
+    /// Writes a motion-model folder with weights in that precision.
+    pub fn save_as(
+        dir: impl AsRef<Path>,
+        config: &MotionConfig,
+        predictor: &PredictorWeights,
+        regressor: &RegressorWeights,
+        precision: Precision,
+    ) -> Result<()> {
         let dir = dir.as_ref();
         let none = BTreeMap::new();
-        write_atomic(dir.join(PREDICTOR_FILE), &pack_tensors(&predictor.named(), &none, Precision::Half)?)?;
-        write_atomic(dir.join(REGRESSOR_FILE), &pack_tensors(&regressor.named(), &none, Precision::Half)?)?;
+        write_atomic(dir.join(PREDICTOR_FILE), &pack_tensors(&predictor.named(), &none, precision)?)?;
+        write_atomic(dir.join(REGRESSOR_FILE), &pack_tensors(&regressor.named(), &none, precision)?)?;
         let mut text = serde_json::to_vec_pretty(config).map_err(|e| Error::invalid(format!("{CONFIG_FILE}: {e}")))?;
         text.push(b'\n');
         write_atomic(dir.join(CONFIG_FILE), &text)
@@ -287,9 +340,6 @@ fn check(path: &Path, c: &MotionConfig) -> Result<()> {
     }
     if c.frames != super::FRAMES {
         return bad("frames", c.frames.to_string(), super::FRAMES.to_string());
-    }
-    if c.canonical != "floor" {
-        return bad("canonical", format!("'{}'", c.canonical), "'floor'".into());
     }
     if c.predictor.frame != MARKER_DIM {
         return bad("predictor.frame", c.predictor.frame.to_string(), MARKER_DIM.to_string());
@@ -348,9 +398,9 @@ mod tests {
         write_atomic(dir.path().join(CONFIG_FILE), &serde_json::to_vec(&config).unwrap()).unwrap();
         let e = MotionWeights::load(dir.path()).unwrap_err().to_string();
         assert!(e.contains("regressor.safetensors") && e.contains("pnet.in_fc.weight") && e.contains("[6, 370]"), "{e}");
-        config.canonical = "pelvis".into();
-        write_atomic(dir.path().join(CONFIG_FILE), &serde_json::to_vec(&config).unwrap()).unwrap();
+        let text = serde_json::to_string(&config).unwrap().replace("floor", "head");
+        write_atomic(dir.path().join(CONFIG_FILE), text.as_bytes()).unwrap();
         let e = MotionWeights::load(dir.path()).unwrap_err().to_string();
-        assert!(e.contains("canonical is 'pelvis', expected 'floor'"), "{e}");
+        assert!(e.contains("motion.json") && e.contains("`head`, expected `floor` or `pelvis`"), "{e}");
     }
 }

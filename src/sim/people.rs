@@ -79,6 +79,14 @@ impl People {
         }
     }
 
+    /// Height of person `i`'s pelvis in the seed's first frame above the floor, metres.
+    ///
+    /// # Panics
+    /// When `i` is not below [`People::len`].
+    pub fn pelvis_height(&self, i: usize) -> f32 {
+        self.joints[i * SEED * JOINT_DIM + 3 * joint::PELVIS + 2]
+    }
+
     /// Whether there is nobody.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()

@@ -2,8 +2,8 @@
 
 use super::people::{JOINT_DIM, PersonMut};
 use super::{People, Primitives};
-use crate::body::{BETAS, BodyModel, MARKER_DIM, PARAMS, POSE, ShapedBody};
-use crate::motion::{FRAMES, FUTURE, MotionModel, SEED};
+use crate::body::{BETAS, BodyModel, MARKER_DIM, PARAMS, POSE, ShapedBody, TRANSL};
+use crate::motion::{FRAMES, FUTURE, MotionModel, Origin, SEED};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex};
@@ -48,7 +48,7 @@ impl Sim {
 
     /// Moves everybody by one primitive of 20 frames, 18 of them new. `latents`: n x latent_dim.
     ///
-    /// 1. Decode 18 frames of markers, regress their bodies, prepend the 2 seed bodies.
+    /// 1. Decode 18 frames of markers, regress their bodies (in canonical frames of the model's own origin), prepend the 2 seed bodies.
     /// 2. Smooth the seam: of frames 2 and 3 (from 0), parameters from index 6 on become the mean of their two neighbours,
     ///    both from the values before smoothing.
     /// 3. New markers = 0.5 x skinned + 0.5 x predicted.
@@ -83,9 +83,21 @@ impl Sim {
         b.regressed.resize(frames * PARAMS, 0.0);
         b.betas.clear();
         b.betas.extend(people.betas.chunks_exact(BETAS).flat_map(|betas| std::iter::repeat_n(betas, FUTURE)).flatten());
-        self.model.decode(&people.markers, latents, &mut b.predicted)?;
-        all_finite("predicted markers", &b.predicted, FUTURE * MARKER_DIM)?;
-        self.model.regress(&b.predicted, &b.betas, &mut b.regressed)
+        let finite = |predicted: &[f32]| all_finite("predicted markers", predicted, FUTURE * MARKER_DIM);
+        if self.model.origin() == Origin::Floor {
+            self.model.decode(&people.markers, latents, &mut b.predicted)?;
+            finite(&b.predicted)?;
+            return self.model.regress(&b.predicted, &b.betas, &mut b.regressed);
+        }
+        // The model's frames have their origin at the pelvis of the seed's first frame instead of on the floor below it.
+        let mut seed = people.markers.clone();
+        shift(people, -1.0, &mut seed, SEED * MARKER_DIM, 3, 2);
+        self.model.decode(&seed, latents, &mut b.predicted)?;
+        finite(&b.predicted)?;
+        self.model.regress(&b.predicted, &b.betas, &mut b.regressed)?;
+        shift(people, 1.0, &mut b.predicted, FUTURE * MARKER_DIM, 3, 2);
+        shift(people, 1.0, &mut b.regressed, FUTURE * PARAMS, PARAMS, TRANSL.start + 2);
+        Ok(())
     }
 
     fn fill(&self, people: &People, b: &Buffers, out: &mut Primitives) {
@@ -139,6 +151,14 @@ fn pose_frames(body: &ShapedBody, params: &[f32], new_markers: &mut [f32], joint
         if t >= SEED {
             body.markers(&posed, &mut new_markers[(t - SEED) * MARKER_DIM..][..MARKER_DIM]);
         }
+    }
+}
+
+/// Adds `sign` times the height of each person's first seed pelvis to number `at` of every `stride`; `data`: n x `each`.
+fn shift(people: &People, sign: f32, data: &mut [f32], each: usize, stride: usize, at: usize) {
+    for (i, data) in data.chunks_exact_mut(each).enumerate() {
+        let height = sign * people.pelvis_height(i);
+        data.iter_mut().skip(at).step_by(stride).for_each(|z| *z += height);
     }
 }
 

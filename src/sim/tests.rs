@@ -62,6 +62,34 @@ impl MotionModel for Screw {
     }
 }
 
+/// [`Screw`] behind frames that start at the pelvis; knows how high that is.
+struct Lowered(Screw, f32);
+
+impl MotionModel for Lowered {
+    fn latent_dim(&self) -> usize {
+        self.0.latent_dim()
+    }
+
+    fn decode(&self, seed: &[f32], latent: &[f32], out: &mut [f32]) -> Result<()> {
+        for (low, high) in seed[..MARKER_DIM].chunks_exact(3).zip(self.0.markers.chunks_exact(3)) {
+            assert!((high[2] - low[2] - self.1).abs() < 1e-5, "{high:?} arrives as {low:?}");
+        }
+        self.0.decode(seed, latent, out)
+    }
+
+    fn regress(&self, markers: &[f32], betas: &[f32], out: &mut [f32]) -> Result<()> {
+        self.0.regress(markers, betas, out)
+    }
+
+    fn hash(&self) -> &str {
+        "lowered"
+    }
+
+    fn origin(&self) -> Origin {
+        Origin::Pelvis
+    }
+}
+
 const BETA: [f32; BETAS] = [0.5; BETAS];
 
 /// `n` people on the seed that walks by `go` per frame, each turned and placed differently, and the model that moves them.
@@ -204,4 +232,22 @@ fn refuses_what_is_not_finite_or_does_not_fit() {
     refuse(&mut people, &[0.0; 6], "views of 3 people");
     let seed = SeedMotion { params: vec![0.0; PARAMS], betas: BETA };
     assert!(people.place(0, &toy(), &seed, 0.0, 0.0, 0.0).unwrap_err().to_string().contains("expected 2 x 93"));
+}
+
+#[test]
+fn models_whose_frames_start_at_the_pelvis_give_the_same() {
+    let go = Frame::planar(0.01, 0.002, 0.02);
+    let (start, body, screw) = walkers(1, go);
+    let height = start.pelvis_height(0);
+    assert!((height - start.joints[2]).abs() < 1e-6 && height.abs() > 0.01);
+    let lowered = Lowered(Screw::new(&body, &start, go), height);
+    let run = |model: Arc<dyn MotionModel>| {
+        let (mut people, mut out) = (start.clone(), Primitives::default());
+        Sim::new(body.clone(), model).step(&mut people, &[0.0; 2], &mut out).unwrap();
+        (people, out)
+    };
+    let ((a, x), (b, y)) = (run(Arc::new(screw)), run(Arc::new(lowered)));
+    let near = |a: &[f32], b: &[f32]| a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5);
+    assert!(near(&x.markers, &y.markers) && near(&x.params, &y.params) && near(&x.joints, &y.joints));
+    assert!(near(&a.markers, &b.markers) && near(&a.params, &b.params));
 }

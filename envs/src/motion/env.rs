@@ -28,7 +28,8 @@ pub enum Starts {
 
 /// n people on the motion task, each in a random scene of its own that changes with every episode.
 ///
-/// Observation: "state" [2, 402] (per seed frame 67 markers, then 67 unit vectors from marker to goal; canonical frame),
+/// Observation: "state" [2, 402] (per seed frame 67 markers, then 67 unit vectors from marker to goal; canonical frame with the origin of
+/// the motion model's),
 /// "egosensing" [2, 32] (see [`egogen::sensing::look`]), "dist" [1] = 1 / (1 + d), "time" [1] = 1 - steps / max_depth.
 /// Action: the latent of the motion model, unbounded. Info: the weighted reward terms. Episodes end on success, on
 /// penetration and at the step limit (all of them terminations). Figures of an episode: see [`EPISODE`].
@@ -184,7 +185,7 @@ impl MotionEnv {
     fn write_obs(&self, obs: &mut [f32]) {
         let State { people, members, .. } = &self.state;
         let rows = obs.par_chunks_exact_mut(OBS).zip(members).with_min_len(CHUNK);
-        rows.enumerate().for_each(|(i, (row, member))| member.observe(&self.task, people, i, row));
+        rows.enumerate().for_each(|(i, (row, member))| member.observe(&self.task, people, i, self.sim.model().origin(), row));
     }
 
     /// Judges everyone after a step; returns who ended.
@@ -231,7 +232,8 @@ impl VecEnv for MotionEnv {
         out.obs.copy_from_slice(&out.final_obs);
         for i in ended {
             self.begin(i, self.state.members[i].episode + 1)?;
-            self.state.members[i].observe(&self.task, &self.state.people, i, &mut out.obs[i * OBS..(i + 1) * OBS]);
+            let row = &mut out.obs[i * OBS..(i + 1) * OBS];
+            self.state.members[i].observe(&self.task, &self.state.people, i, self.sim.model().origin(), row);
         }
         Ok(())
     }

@@ -3,7 +3,7 @@
 use super::rewards::{Outcome, OwnTerm, TERMS};
 use super::{EPISODE, MotionTask};
 use egogen::body::{JOINTS, MARKER_DIM, canonical_frame, joint};
-use egogen::motion::{FRAMES, SEED};
+use egogen::motion::{FRAMES, Origin, SEED};
 use egogen::scene::{Polygon, Setting};
 use egogen::sensing::{RAYS, look_person};
 use egogen::sim::{People, Primitives};
@@ -60,14 +60,18 @@ impl Member {
         Self { episode, setting, goal, dist, min_dist, ..Self::default() }
     }
 
-    /// Writes the observation row of person `i`.
-    pub fn observe(&self, task: &MotionTask, people: &People, i: usize, row: &mut [f32]) {
+    /// Writes the observation row of person `i`; markers count from `origin`.
+    pub fn observe(&self, task: &MotionTask, people: &People, i: usize, origin: Origin, row: &mut [f32]) {
         let (state, rest) = row.split_at_mut(STATE);
         let (rays, scalars) = rest.split_at_mut(SEED * RAYS);
         let goal = people.frames[i].inverse().point(self.goal);
         let markers = &people.markers[i * SEED * MARKER_DIM..][..SEED * MARKER_DIM];
         for (frame, out) in markers.chunks_exact(MARKER_DIM).zip(state.chunks_exact_mut(2 * MARKER_DIM)) {
             out[..MARKER_DIM].copy_from_slice(frame);
+            if origin == Origin::Pelvis {
+                let height = people.pelvis_height(i);
+                out[..MARKER_DIM].iter_mut().skip(2).step_by(3).for_each(|z| *z -= height);
+            }
             for (m, to) in frame.chunks_exact(3).zip(out[MARKER_DIM..].chunks_exact_mut(3)) {
                 (goal - Vec3::from_slice(m)).normalize_or_zero().write_to_slice(to);
             }

@@ -5,6 +5,7 @@ use super::{EPISODE, MotionEnv, MotionTask, TERMS};
 use crate::conformance::{Effort, check};
 use crate::{EnvError, StepResult, VecEnv};
 use egogen::body::{BETAS, BodyModel, Frame, MARKER_DIM, joint};
+use egogen::motion::Origin;
 use egogen::scene::{SparseKind, SparseScenes};
 use egogen::sim::{SeedBank, SeedMotion, Sim};
 use glam::{Vec2, Vec3};
@@ -166,6 +167,25 @@ fn observations_point_to_the_goal() {
             }
         }
         assert!(row[804..868].iter().all(|r| (-1.0..=1.0).contains(r)) && row[804..868].iter().any(|&r| r > -1.0));
+    }
+}
+
+#[test]
+fn markers_count_from_the_origin_of_the_motion_model() {
+    let (sim, bank) = world();
+    let mut toy = Toy::new();
+    toy.origin = Origin::Pelvis;
+    let lowered = Arc::new(Sim::new(sim.body().clone(), Arc::new(toy)));
+    let [floor, pelvis] = [sim, lowered].map(|sim| MotionEnv::new(MotionTask::default(), sim, bank.clone(), 2, 9).unwrap());
+    let height = floor.people().pelvis_height(0);
+    assert!((0.8..1.1).contains(&height), "{height}");
+    let (mut a, mut b) = (vec![], vec![]);
+    floor.observe(&mut a).unwrap();
+    pelvis.observe(&mut b).unwrap();
+    for (k, (a, b)) in a.iter().zip(&b).enumerate() {
+        let column = k % 870;
+        let is_z = column < 804 && column % 402 < MARKER_DIM && column % 402 % 3 == 2;
+        assert!((a - b - if is_z { height } else { 0.0 }).abs() < 1e-5, "number {column} is {a} and {b}");
     }
 }
 

@@ -1,7 +1,7 @@
 //! A motion model of a stiff figure that glides, for tests: latent 0 is its speed in m/s, latent 1 its turn in rad/s.
 
 use egogen::body::{BETAS, BodyModel, Frame, MARKER_DIM, ORIENT, PARAMS, POSE, ShapedBody, TRANSL, rotation};
-use egogen::motion::{FPS, FUTURE, MotionModel, SEED};
+use egogen::motion::{FPS, FUTURE, MotionModel, Origin, SEED};
 use glam::{Mat3, Vec2, Vec3};
 use std::f32::consts::FRAC_PI_2;
 
@@ -10,6 +10,7 @@ pub struct Toy {
     /// The figure facing +y at the origin, arms down, soles on the floor.
     params: [f32; PARAMS],
     markers: Vec<f32>,
+    pub origin: Origin,
 }
 
 impl Toy {
@@ -27,7 +28,7 @@ impl Toy {
         let low = markers.iter().skip(2).step_by(3).fold(f32::INFINITY, |a, &b| a.min(b));
         params[TRANSL][2] -= low;
         body.markers(&body.pose(&params), &mut markers);
-        Self { body, params, markers }
+        Self { body, params, markers, origin: Origin::Floor }
     }
 
     /// The figure's body at a place.
@@ -52,6 +53,10 @@ impl Toy {
 impl MotionModel for Toy {
     fn latent_dim(&self) -> usize {
         4
+    }
+
+    fn origin(&self) -> Origin {
+        self.origin
     }
 
     fn decode(&self, seed: &[f32], latent: &[f32], out: &mut [f32]) -> egogen::Result<()> {

@@ -1,10 +1,10 @@
-//! Trains and judges the motion-primitive model.
+//! Trains, judges and imports the motion-primitive model.
 
 use clap::{Args, Parser, Subcommand};
 use egogen::body::BodyModel;
 use egogen::io::{Tensors, write_atomic};
 use egogen::kernels::MotionEngine;
-use egogen::motion::{self, MotionSet, MotionWeights, PosePrior};
+use egogen::motion::{self, MotionSet, MotionWeights, PosePrior, authors};
 use egogen::sim::Sim;
 use egogen_train::primitives::bodies;
 use egogen_train::primitives::eval::{Effort, evaluate};
@@ -22,7 +22,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Trains and judges the motion-primitive model.
+/// Trains, judges and imports the motion-primitive model.
 #[derive(Parser)]
 #[command(version)]
 struct Cli {
@@ -46,6 +46,24 @@ enum Command {
     Bodies(Bodies),
     /// Write seeds.safetensors, seeds for the walking task made by the model, into its folder.
     Seeds(Seeds),
+    /// Make a motion-model folder of the authors' own networks (PyTorch checkpoints) and the body they were trained on.
+    Import(Import),
+}
+
+#[derive(Args)]
+struct Import {
+    /// Checkpoint of the marker predictor, e.g. epoch-400.ckp.
+    #[arg(long, value_name = "FILE")]
+    predictor: PathBuf,
+    /// Checkpoint of the body regressor of the body's gender, e.g. epoch-100.ckp.
+    #[arg(long, value_name = "FILE")]
+    regressor: PathBuf,
+    /// The body whose markers they have learned: SMPLX_{MALE,FEMALE,NEUTRAL}.npz.
+    #[arg(long, value_name = "FILE")]
+    body: PathBuf,
+    /// Folder for motion.json, both networks and the body; `primitives seeds` then adds seeds.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
 }
 
 #[derive(Args)]
@@ -153,6 +171,11 @@ fn run(command: Command) -> Result<u8> {
             let body = BodyModel::beside(&args.model).given()?;
             let (set, ..) = motion::build(&args.data.data, args.data.data_seed, &body).given()?;
             write_seeds(&args.model, &body, &set)?;
+            Ok(0)
+        }
+        Command::Import(args) => {
+            let weights = authors::import(&args.predictor, &args.regressor, &args.body, &args.out).given()?;
+            eprintln!("{}: motion model {} on body {}", args.out.display(), weights.hash, weights.config.body);
             Ok(0)
         }
     }

@@ -10,7 +10,7 @@ use egogen::Error;
 use egogen::body::{BETAS, BodyModel, MARKER_DIM, PARAMS, ShapedBody};
 use egogen::kernels::{MotionEngine, Regressor};
 use egogen::metrics::kl_to_standard;
-use egogen::motion::{FRAMES, FUTURE, LATENT, MotionSet, MotionWeights, PredictorWeights, SEED};
+use egogen::motion::{FRAMES, FUTURE, LATENT, MotionSet, MotionWeights, Origin, PredictorWeights, SEED};
 use egogen::rng::stream;
 use egogen::scene::{SparseKind, SparseScenes};
 use egogen::sim::{SeedBank, Sim};
@@ -88,8 +88,8 @@ pub fn evaluate(weights: &MotionWeights, body: &Arc<BodyModel>, train: &MotionSe
     })
 }
 
-/// All windows of `set`, time-major: their number, seeds and futures.
-fn windows_of(set: &MotionSet) -> Result<(usize, Vec<f32>, Vec<f32>)> {
+/// All windows of `set` in canonical frames with that origin, time-major: their number, seeds and futures.
+fn windows_of(set: &MotionSet, origin: Origin) -> Result<(usize, Vec<f32>, Vec<f32>)> {
     let windows = set.windows(FRAMES, 5);
     let n = windows.len();
     if n == 0 {
@@ -98,7 +98,7 @@ fn windows_of(set: &MotionSet) -> Result<(usize, Vec<f32>, Vec<f32>)> {
     let (mut seed, mut future) = (vec![0.0; n * SEED * MARKER_DIM], vec![0.0; n * FUTURE * MARKER_DIM]);
     let mut window = vec![0.0; FRAMES * MARKER_DIM];
     for (i, (clip, start)) in windows.into_iter().enumerate() {
-        set.canonical_window(clip, start, FRAMES, &mut window);
+        set.window(origin, clip, start, FRAMES, &mut window);
         for (t, frame) in window.chunks_exact(MARKER_DIM).enumerate() {
             let (to, t) = if t < SEED { (&mut seed, t) } else { (&mut future, t - SEED) };
             to[(t * n + i) * MARKER_DIM..][..MARKER_DIM].copy_from_slice(frame);
@@ -109,7 +109,7 @@ fn windows_of(set: &MotionSet) -> Result<(usize, Vec<f32>, Vec<f32>)> {
 
 /// Distance of the posterior mean from the motion of `set`, mm: over all 18 frames, and in the last.
 pub fn held_out_error(predictor: &PredictorWeights, set: &MotionSet) -> Result<[f32; 2]> {
-    let (n, seed, future) = windows_of(set)?;
+    let (n, seed, future) = windows_of(set, Origin::Floor)?;
     let ready = Ready::new(predictor)?;
     let mut tape = Tape::default();
     tape.encode(&ready, &seed, &future, n);
@@ -125,7 +125,7 @@ pub fn held_out_error(predictor: &PredictorWeights, set: &MotionSet) -> Result<[
 /// # Errors
 /// If no clip holds a window.
 pub fn judge_held_out(weights: &MotionWeights, body: &ShapedBody, set: &MotionSet) -> Result<HeldOut> {
-    let (n, seed, future) = windows_of(set)?;
+    let (n, seed, future) = windows_of(set, weights.config.canonical)?;
     let ready = Ready::new(&weights.predictor)?;
     let mut tape = Tape::default();
     tape.encode(&ready, &seed, &future, n);

@@ -75,7 +75,7 @@ pub enum Kind {
 impl Export {
     /// Writes the .glb, the .npz and the .png.
     pub fn run(&self) -> Result<u8> {
-        let body = BodyModel::embedded();
+        let body = self.model.as_ref().map_or_else(|| Ok(BodyModel::embedded()), BodyModel::beside).given()?;
         let frames = match (&self.kind, &self.clip, &self.file) {
             (Some(kind), ..) => made(self, *kind)?,
             (_, Some(name), _) => recorded(self, name, &body)?,

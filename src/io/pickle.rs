@@ -1,8 +1,11 @@
-//! A strict reader of Python pickles that hold plain values and NumPy arrays.
+//! A strict reader of Python pickles that hold plain values and NumPy arrays, or PyTorch's tensors.
 //!
 //! A pickle is a program. Nothing of it is executed: the calls by which NumPy stores an array (`_reconstruct`, `_frombuffer`, `scalar`,
 //! `dtype`, and `_codecs.encode`, by which protocol 2 stores bytes) are recognised as data; every other name and every opcode that NumPy
 //! does not need is refused by name. Values live in one list and refer to each other by index, and bytes stay in the file.
+//!
+//! A checkpoint of PyTorch may hold objects of any class beside its tensors. There the calls by which PyTorch stores tensors are recognised
+//! (`_rebuild_tensor_v2`, `_rebuild_parameter`, `OrderedDict`, storages by name); what any other call would give is an opaque value.
 
 use crate::io::numpy::{Array, Dtype};
 use crate::{Error, Result};
@@ -20,6 +23,63 @@ enum Global {
     Ndarray,
     Dtype,
     Encode,
+    OrderedDict,
+    RebuildTensor,
+    RebuildParameter,
+    /// A storage of elements of that type.
+    Storage(Element),
+    /// A name of a checkpoint that stands for nothing read here.
+    Other,
+}
+
+/// Type of the elements of a tensor, as far as networks' weights go.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Element {
+    F64,
+    F32,
+    F16,
+    BF16,
+    /// Whole numbers of that many bytes.
+    Whole(usize),
+}
+
+impl Element {
+    /// The elements of a storage class of torch.
+    fn of_storage(name: &str) -> Option<Self> {
+        Some(match name {
+            "DoubleStorage" => Self::F64,
+            "FloatStorage" => Self::F32,
+            "HalfStorage" => Self::F16,
+            "BFloat16Storage" => Self::BF16,
+            "LongStorage" => Self::Whole(8),
+            "IntStorage" => Self::Whole(4),
+            "ShortStorage" => Self::Whole(2),
+            "CharStorage" | "ByteStorage" | "BoolStorage" => Self::Whole(1),
+            _ => return None,
+        })
+    }
+
+    /// Bytes of one element.
+    pub fn bytes(self) -> usize {
+        match self {
+            Self::F64 => 8,
+            Self::F32 => 4,
+            Self::F16 | Self::BF16 => 2,
+            Self::Whole(n) => n,
+        }
+    }
+}
+
+/// A tensor: a view of a storage.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct TensorView<'a> {
+    pub element: Element,
+    /// Name of the storage within its file.
+    pub storage: &'a str,
+    /// In elements, as the strides.
+    pub offset: usize,
+    pub shape: Vec<usize>,
+    pub strides: Vec<usize>,
 }
 
 #[derive(Clone, Debug)]
@@ -47,14 +107,26 @@ enum Node<'a> {
         fortran: bool,
         data: Id,
     },
+    Storage {
+        element: Element,
+        name: &'a str,
+    },
+    Tensor(TensorView<'a>),
+    /// A value that is not read.
+    Opaque,
 }
 
 /// A pickle that holds a dict.
-pub(super) struct Pickle<'a> {
+pub(crate) struct Pickle<'a> {
     path: PathBuf,
     nodes: Vec<Node<'a>>,
     items: Vec<(Id, Id)>,
 }
+
+/// Values that one walk through a checkpoint may come by: a few bytes can refer to the same value without end.
+const MAX_VALUES: usize = 1 << 20;
+/// How deep its dictionaries may lie.
+const MAX_DEPTH: usize = 16;
 
 /// The state of reading.
 struct Machine<'a> {
@@ -66,6 +138,8 @@ struct Machine<'a> {
     /// Heights of the stack at its marks.
     marks: Vec<usize>,
     memo: HashMap<usize, Id>,
+    /// Whether it is a checkpoint of PyTorch.
+    torch: bool,
 }
 
 impl<'a> Pickle<'a> {
@@ -74,13 +148,59 @@ impl<'a> Pickle<'a> {
         if !matches!(bytes, [0x80, 2..=5, ..]) {
             return Err(Error::file(path, "is no Python pickle of protocol 2 to 5"));
         }
-        let mut machine = Machine { path, bytes, at: 0, nodes: Vec::new(), stack: Vec::new(), marks: Vec::new(), memo: HashMap::new() };
-        while machine.step()? {}
-        let root = machine.pop()?;
+        Self::run(path, bytes, false).map(|(pickle, _)| pickle)
+    }
+
+    /// Takes a pickle of PyTorch's tensors that holds a dict, and says where it ends in `bytes`.
+    pub fn parse_torch(path: &'a Path, bytes: &'a [u8]) -> Result<(Self, usize)> {
+        Self::run(path, bytes, true)
+    }
+
+    /// The texts in the list that is the pickle at the start of `bytes`, and where it ends.
+    pub fn parse_texts(path: &'a Path, bytes: &'a [u8]) -> Result<(Vec<&'a str>, usize)> {
+        let (machine, root) = Machine::run(path, bytes, true)?;
+        let Node::List(list) = &machine.nodes[root] else { return Err(Error::file(path, "holds no list of its storages")) };
+        Ok((list.iter().filter_map(|&id| text(&machine.nodes[id])).collect(), machine.at))
+    }
+
+    fn run(path: &'a Path, bytes: &'a [u8], torch: bool) -> Result<(Self, usize)> {
+        let (machine, root) = Machine::run(path, bytes, torch)?;
         match machine.nodes[root].clone() {
-            Node::Dict(items) => Ok(Self { path: path.into(), nodes: machine.nodes, items }),
+            Node::Dict(items) => Ok((Self { path: path.into(), nodes: machine.nodes, items }, machine.at)),
             _ => Err(Error::file(path, "holds no dict")),
         }
+    }
+
+    /// All tensors in the dict and the dicts within it, by their keys joined with dots.
+    pub fn tensors(&self) -> Result<Vec<(String, TensorView<'a>)>> {
+        let (mut found, mut open, mut seen) = (Vec::new(), vec![(String::new(), 0, &self.items)], 0);
+        while let Some((prefix, depth, items)) = open.pop() {
+            for &(key, value) in items {
+                seen += 1;
+                if seen > MAX_VALUES {
+                    return Err(Error::file(&self.path, format!("holds more than {MAX_VALUES} values")));
+                }
+                let key = match &self.nodes[key] {
+                    Node::Number(n) => n.to_string(),
+                    other => text(other).unwrap_or("?").to_string(),
+                };
+                match &self.nodes[value] {
+                    Node::Tensor(view) => found.push((format!("{prefix}{key}"), view.clone())),
+                    Node::Dict(items) if depth < MAX_DEPTH => open.push((format!("{prefix}{key}."), depth + 1, items)),
+                    _ => {}
+                }
+            }
+        }
+        Ok(found)
+    }
+
+    /// Element types of all storages by name.
+    pub fn storages(&self) -> HashMap<&'a str, Element> {
+        let storage = |node: &Node<'a>| match *node {
+            Node::Storage { element, name } => Some((name, element)),
+            _ => None,
+        };
+        self.nodes.iter().filter_map(storage).collect()
     }
 
     /// The numbers of the value of `key`: an array or a plain number.
@@ -101,12 +221,7 @@ impl<'a> Pickle<'a> {
     fn decode(&self, dtype: Id, shape: Id, fortran: bool, data: Id) -> std::result::Result<Array, String> {
         let Node::Dtype { name, big } = self.nodes[dtype] else { return Err("has no element type".into()) };
         let dtype = Dtype::parse(name).ok_or_else(|| format!("has elements of type '{name}', expected numbers"))?;
-        let Node::Tuple(dims) = &self.nodes[shape] else { return Err("has no shape".into()) };
-        let dim = |id: &Id| match self.nodes[*id] {
-            Node::Number(n) if n >= 0.0 && n < 2f64.powi(40) => Ok(n as usize),
-            _ => Err("has a shape that is no tuple of whole numbers".to_string()),
-        };
-        let shape = dims.iter().map(dim).collect::<std::result::Result<Vec<_>, _>>()?;
+        let shape = sizes(&self.nodes, shape).ok_or("has a shape that is no tuple of whole numbers")?;
         let bytes: Cow<[u8]> = match &self.nodes[data] {
             Node::Bytes(bytes) => Cow::Borrowed(bytes),
             Node::Latin(text) => {
@@ -115,6 +230,19 @@ impl<'a> Pickle<'a> {
             _ => return Err("does not hold its elements as bytes".into()),
         };
         Array::decode(&Dtype { big, ..dtype }, shape, fortran, &bytes)
+    }
+}
+
+/// The whole numbers of a tuple.
+fn sizes(nodes: &[Node], tuple: Id) -> Option<Vec<usize>> {
+    let Node::Tuple(items) = &nodes[tuple] else { return None };
+    items.iter().map(|&id| size(&nodes[id])).collect()
+}
+
+fn size(node: &Node) -> Option<usize> {
+    match *node {
+        Node::Number(n) if n >= 0.0 && n < 2f64.powi(40) => Some(n as usize),
+        _ => None,
     }
 }
 
@@ -128,6 +256,15 @@ fn text<'a>(node: &Node<'a>) -> Option<&'a str> {
 }
 
 impl<'a> Machine<'a> {
+    /// Reads one pickle; the state after it and what it holds.
+    fn run(path: &'a Path, bytes: &'a [u8], torch: bool) -> Result<(Self, Id)> {
+        let (nodes, stack, marks, memo) = (Vec::new(), Vec::new(), Vec::new(), HashMap::new());
+        let mut machine = Self { path, bytes, at: 0, nodes, stack, marks, memo, torch };
+        while machine.step()? {}
+        let root = machine.pop()?;
+        Ok((machine, root))
+    }
+
     fn error(&self, what: impl AsRef<str>) -> Error {
         Error::file(self.path, format!("pickle byte {}: {}", self.at, what.as_ref()))
     }
@@ -243,6 +380,12 @@ impl<'a> Machine<'a> {
             }
             b'R' => self.reduce()?,
             b'b' => self.build()?,
+            b'Q' if self.torch => self.storage()?,
+            0x81 if self.torch => {
+                self.pop()?;
+                self.pop()?;
+                self.push(Node::Opaque);
+            }
             _ => self.plain(op)?,
         }
         Ok(true)
@@ -297,6 +440,7 @@ impl<'a> Machine<'a> {
         match &mut self.nodes[target] {
             Node::Dict(dict) if matches!(op, b's' | b'u') => dict.extend(items.as_chunks::<2>().0.iter().map(|&[k, v]| (k, v))),
             Node::List(list) if matches!(op, b'a' | b'e') => list.extend(items),
+            Node::Opaque => {}
             _ => return Err(self.error("puts items into what is no dict or list")),
         }
         Ok(())
@@ -310,6 +454,11 @@ impl<'a> Machine<'a> {
             ("numpy", "ndarray") => Global::Ndarray,
             ("numpy", "dtype") => Global::Dtype,
             ("_codecs", "encode") => Global::Encode,
+            ("collections", "OrderedDict") if self.torch => Global::OrderedDict,
+            ("torch._utils", "_rebuild_tensor_v2") if self.torch => Global::RebuildTensor,
+            ("torch._utils", "_rebuild_parameter") if self.torch => Global::RebuildParameter,
+            ("torch", name) if self.torch => Element::of_storage(name).map_or(Global::Other, Global::Storage),
+            _ if self.torch => Global::Other,
             _ => return Err(self.error(format!("'{module}.{name}' is refused: only NumPy's arrays are read"))),
         };
         self.push(Node::Global(global));
@@ -319,7 +468,11 @@ impl<'a> Machine<'a> {
     /// The value that a call stands for.
     fn reduce(&mut self) -> Result<()> {
         let (args, callee) = (self.pop()?, self.pop()?);
-        let Node::Global(callee) = self.nodes[callee] else { return Err(self.error("calls what is no function")) };
+        let callee = match self.nodes[callee] {
+            Node::Global(callee) => callee,
+            Node::Opaque => Global::Other,
+            _ => return Err(self.error("calls what is no function")),
+        };
         let Node::Tuple(args) = self.nodes[args].clone() else { return Err(self.error("calls without a tuple of arguments")) };
         let node = match (callee, &args[..]) {
             (Global::Reconstruct, [class, _, _]) if matches!(self.nodes[*class], Node::Global(Global::Ndarray)) => Node::EmptyArray,
@@ -338,16 +491,60 @@ impl<'a> Machine<'a> {
                 Node::Text(text) => Node::Latin(text),
                 _ => return Err(self.error("_codecs.encode of what is no text")),
             },
+            (Global::OrderedDict, _) => Node::Dict(self.pairs(&args)),
+            (Global::RebuildTensor, &[storage, offset, shape, strides, ..]) => self.tensor([storage, offset, shape, strides])?,
+            (Global::RebuildParameter, &[tensor, ..]) => self.nodes[tensor].clone(),
+            _ if self.torch => Node::Opaque,
             _ => return Err(self.error(format!("{callee:?} with {} arguments that are not NumPy's", args.len()))),
         };
         self.push(node);
         Ok(())
     }
 
+    /// Keys and values of a list of pairs, where that is the one argument.
+    fn pairs(&self, args: &[Id]) -> Vec<(Id, Id)> {
+        let [list] = args else { return Vec::new() };
+        let Node::List(list) = &self.nodes[*list] else { return Vec::new() };
+        let pair = |&id: &Id| match &self.nodes[id] {
+            Node::Tuple(pair) | Node::List(pair) => pair.as_slice().try_into().ok().map(|[k, v]: [Id; 2]| (k, v)),
+            _ => None,
+        };
+        list.iter().filter_map(pair).collect()
+    }
+
+    /// A storage from ('storage', class, name, device, elements): where its elements are.
+    fn storage(&mut self) -> Result<()> {
+        let id = self.pop()?;
+        let Node::Tuple(fields) = &self.nodes[id] else { return Err(self.error("a storage whose description is no tuple")) };
+        // Older files may describe a view of another storage in a sixth field; those are not read.
+        let whole = fields.len() == 5 || fields.len() == 6 && matches!(self.nodes[fields[5]], Node::None);
+        let node = match (&self.nodes[*fields.get(1).unwrap_or(&id)], fields.get(2).and_then(|&name| text(&self.nodes[name]))) {
+            (Node::Global(Global::Storage(element)), Some(name)) if whole => Node::Storage { element: *element, name },
+            _ => Node::Opaque,
+        };
+        self.push(node);
+        Ok(())
+    }
+
+    fn tensor(&self, [storage, offset, shape, strides]: [Id; 4]) -> Result<Node<'a>> {
+        let Node::Storage { element, name } = self.nodes[storage] else { return Ok(Node::Opaque) };
+        let (offset, shape, strides) = (size(&self.nodes[offset]), sizes(&self.nodes, shape), sizes(&self.nodes, strides));
+        let (Some(offset), Some(shape), Some(strides)) = (offset, shape, strides) else {
+            return Err(self.error(format!("a tensor of storage {name} whose sizes are no whole numbers")));
+        };
+        if shape.len() != strides.len() {
+            return Err(self.error(format!("a tensor of storage {name} with {} sizes and {} strides", shape.len(), strides.len())));
+        }
+        Ok(Node::Tensor(TensorView { element, storage: name, offset, shape, strides }))
+    }
+
     /// Gives an array or an element type its content.
     fn build(&mut self) -> Result<()> {
         let state = self.pop()?;
         let target = self.top()?;
+        if self.torch {
+            return Ok(());
+        }
         let Node::Tuple(state) = self.nodes[state].clone() else { return Err(self.error("a state that is no tuple")) };
         let built = match (&self.nodes[target], &state[..]) {
             (Node::EmptyArray, &[_version, shape, dtype, fortran, data]) => {

@@ -62,6 +62,17 @@ pub enum ActorScale {
     Code,
 }
 
+/// How dense layers start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Init {
+    /// Orthogonal with gain sqrt 2, biases zero, actor layers scaled as `actor_scale` says.
+    #[default]
+    Orthogonal,
+    /// As torch's layers start: weights and biases uniform in +-1/sqrt(inputs), the actor's too.
+    Uniform,
+}
+
 /// What follows a plain layer.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -124,6 +135,9 @@ pub struct PolicyConfig {
     /// Which actor layers start 100 times smaller.
     #[serde(default)]
     pub actor_scale: ActorScale,
+    /// How dense layers start.
+    #[serde(default)]
+    pub init: Init,
 }
 
 impl Default for PolicyConfig {
@@ -142,6 +156,7 @@ impl Default for PolicyConfig {
             obs_norm: false,
             logvar: default_logvar(),
             actor_scale: ActorScale::default(),
+            init: Init::default(),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Initial weights.
 
-use super::{ActorScale, Dense, Part, PolicySpec};
+use super::{ActorScale, Dense, Init, Part, PolicySpec};
 use crate::rng::{Stream, stream};
 use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
@@ -11,7 +11,8 @@ const SMALL: f32 = 0.01;
 
 impl PolicySpec {
     /// Initial parameters: orthogonal with gain sqrt 2 and zero biases, the chosen actor layers x 0.01; GRUs as in torch,
-    /// uniform in +-1/sqrt(hidden). Every layer draws from a stream of its own.
+    /// uniform in +-1/sqrt(hidden), as are, with [`Init::Uniform`], all layers in +-1/sqrt(inputs). Every layer draws from a stream of
+    /// its own.
     pub fn init(&self, seed: u64) -> Vec<f32> {
         let mut flat = vec![0.0; self.params()];
         let mut recurrent = vec![None; self.layers.len()];
@@ -23,9 +24,10 @@ impl PolicySpec {
         for (i, layer) in self.layers.iter().enumerate() {
             let mut rng = stream(seed, "policy weights", i as u64);
             let block = &mut flat[layer.offset..layer.offset + layer.params()];
-            match recurrent[i] {
-                Some(hidden) => block.fill_with(|| rng.random_range(-1.0..1.0) / (hidden as f32).sqrt()),
-                None => orthogonal(layer, std::f32::consts::SQRT_2 * self.scale(i), &mut rng, block),
+            match (recurrent[i], self.config.init) {
+                (Some(hidden), _) => uniform(hidden, &mut rng, block),
+                (None, Init::Uniform) => uniform(layer.input, &mut rng, block),
+                (None, Init::Orthogonal) => orthogonal(layer, std::f32::consts::SQRT_2 * self.scale(i), &mut rng, block),
             }
         }
         let log_std = self.config.state_noise.map(|noise| noise.log_std).or(self.config.log_std);
@@ -42,6 +44,11 @@ impl PolicySpec {
         };
         if scaled { SMALL } else { 1.0 }
     }
+}
+
+/// Fills `out` with draws from +-1/sqrt(width).
+fn uniform(width: usize, rng: &mut Stream, out: &mut [f32]) {
+    out.fill_with(|| rng.random_range(-1.0..1.0) / (width as f32).sqrt());
 }
 
 /// Fills the weight with `gain` times orthonormal rows (or columns, whichever are fewer).
@@ -128,6 +135,23 @@ mod tests {
             assert!(layer.bias_of(&flat).iter().all(|&b| b == 0.0));
         }
         assert_eq!(flat[spec.log_std_range()], [-0.5; 3]);
+    }
+
+    #[test]
+    fn layers_start_as_torchs_when_told_to() {
+        let layout = ObsLayout::new(vec![ObsGroup { name: "state".into(), shape: vec![5] }]);
+        let config = serde_json::json!({"hidden": [400], "log_std": -0.5, "init": "uniform"});
+        let spec = PolicySpec::new(serde_json::from_value(config).unwrap(), layout, 300).unwrap();
+        let flat = spec.init(3);
+        for layer in &spec.layers {
+            // The whole block, biases too: mean 0, and the standard deviation and range of a uniform distribution.
+            let block = &flat[layer.offset..layer.offset + layer.params()];
+            let bound = 1.0 / (layer.input as f32).sqrt();
+            let n = block.len() as f32;
+            let std = (block.iter().map(|x| x * x).sum::<f32>() / n).sqrt();
+            assert!((std - bound / 3f32.sqrt()).abs() < 0.6 * bound / n.sqrt(), "{}: {std}", layer.weight);
+            assert!(block.iter().all(|x| x.abs() <= bound) && block.iter().any(|x| x.abs() > 0.97 * bound), "{}", layer.weight);
+        }
     }
 
     #[test]

@@ -16,16 +16,7 @@ fn policy() -> PolicySpec {
     let layout = ObsLayout::new(vec![group("state", &[2, 402]), group("egosensing", &[2, 32]), group("dist", &[1]), group("time", &[1])]);
     let config = PolicyConfig {
         gru: BTreeMap::from([("state".into(), 128), ("egosensing".into(), 128)]),
-        octaves: 12,
-        trunk: None,
-        blocks: 2,
-        hidden: vec![],
-        activation: Default::default(),
-        shared: false,
-        log_std: None,
-        obs_norm: false,
-        logvar: [-2.5, 2.5],
-        actor_scale: Default::default(),
+        ..Default::default()
     };
     PolicySpec::new(config, layout, 128).expect("sizes are good")
 }

@@ -14,10 +14,7 @@ use std::collections::BTreeMap;
 fn policy() -> PolicySpec {
     let group = |name: &str, shape: &[usize]| ObsGroup { name: name.into(), shape: shape.into() };
     let layout = ObsLayout::new(vec![group("state", &[2, 402]), group("egosensing", &[2, 32]), group("dist", &[1]), group("time", &[1])]);
-    let config = PolicyConfig {
-        gru: BTreeMap::from([("state".into(), 128), ("egosensing".into(), 128)]),
-        ..Default::default()
-    };
+    let config = PolicyConfig { gru: BTreeMap::from([("state".into(), 128), ("egosensing".into(), 128)]), ..Default::default() };
     PolicySpec::new(config, layout, 128).expect("sizes are good")
 }
 

@@ -11,19 +11,19 @@ type Cart = (f32, f32, u32);
 type Term = (&'static str, fn(Cart, f32) -> f32);
 const TERMS: [Term; 2] = [("near", |(x, ..), _| -x.abs()), ("effort", |_, push| -0.1 * push * push)];
 
-pub struct Carts(EnvSpec, Vec<(Stream, Cart)>);
+pub struct Carts(EnvSpec, Vec<(Cart, Stream)>);
 
 impl Carts {
     pub fn new(n: usize, seed: u64) -> Self {
         let (obs, info) = (ObsGroup { name: "cart".into(), shape: vec![2] }, TERMS.map(|(name, _)| name.into()).to_vec());
         let spec = EnvSpec { obs: vec![obs], action: ActionSpace::Continuous(1), info, episode: vec![] };
-        Self(spec, (0..n as u64).map(|i| begun(stream(seed, "carts", i))).collect())
+        let begin = |mut rng| (begun(&mut rng), rng);
+        Self(spec, (0..n as u64).map(|i| begin(stream(seed, "carts", i))).collect())
     }
 }
 
-fn begun(mut rng: Stream) -> (Stream, Cart) {
-    let x = rng.random_range(-1.0..1.0);
-    (rng, (x, 0.0, 0))
+fn begun(rng: &mut Stream) -> Cart {
+    (rng.random_range(-1.0..1.0), 0.0, 0)
 }
 
 #[rustfmt::skip]
@@ -37,13 +37,13 @@ impl VecEnv for Carts {
     fn step(&mut self, actions: &[f32], out: &mut StepResult) -> Result<(), EnvError> {
         self.0.check_actions(self.1.len(), actions)?;
         out.prepare(&self.0, self.1.len());
-        for (i, (rng, cart)) in self.1.iter_mut().enumerate() {
+        for (i, (cart, rng)) in self.1.iter_mut().enumerate() {
             let push = actions[i].clamp(-1.0, 1.0);
             *cart = (cart.0 + 0.1 * cart.1, cart.1 + 0.1 * push, cart.2 + 1);
             out.info[2 * i..2 * i + 2].copy_from_slice(&TERMS.map(|(_, term)| term(*cart, push)));
             (out.reward[i], out.truncated[i]) = (out.info[2 * i] + out.info[2 * i + 1], cart.2 == 50);
             out.final_obs[2 * i..2 * i + 2].copy_from_slice(&[cart.0, cart.1]);
-            *cart = if out.truncated[i] { (rng.random_range(-1.0..1.0), 0.0, 0) } else { *cart };
+            *cart = if out.truncated[i] { begun(rng) } else { *cart };
         }
         self.observe(&mut out.obs)
     }
@@ -53,7 +53,7 @@ impl VecEnv for Carts {
         if carts.len() == self.1.len() { self.1 = carts; Ok(()) } else { Err(EnvError::Invalid("another number of carts".into())) }
     }
     fn observe(&self, obs: &mut Vec<f32>) -> Result<(), EnvError> {
-        *obs = self.1.iter().flat_map(|(_, (x, speed, _))| [*x, *speed]).collect();
+        *obs = self.1.iter().flat_map(|((x, speed, _), _)| [*x, *speed]).collect();
         Ok(())
     }
 }

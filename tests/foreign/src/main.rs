@@ -2,18 +2,12 @@
 
 mod carts;
 
-use egogen_envs::motion::Outcome;
 use egogen_train::registry::{Made, Registry};
-use std::process::ExitCode;
 
-/// Walking upright: the head above the pelvis, metres.
-fn upright(outcome: &Outcome) -> f32 {
-    outcome.head.z - outcome.pelvis.z
-}
-
-fn main() -> ExitCode {
+fn main() -> std::process::ExitCode {
     let mut registry = Registry::standard();
     registry.add("carts", |_, n, _| Ok(Made { env: Box::new(carts::Carts::new(n, 0)), origin: Default::default() }));
-    registry.add_motion("motion", &[("upright", upright)]);
+    // Walking upright: the head above the pelvis, metres.
+    registry.add_motion("motion", &[("upright", |outcome| outcome.head.z - outcome.pelvis.z)]);
     egogen_train::cli::run(&registry)
 }

@@ -3,8 +3,7 @@
     python peer.py sb3|tianshou RECIPE.toml SEED
 
 The recipe's [run], [policy], [ppo] and [adam] are what the library is given; it must be one of plain layers with a log standard
-deviation that is a parameter, or of discrete actions. The time is
-the processor's, of training alone: no imports, set-up or tests.
+deviation that is a parameter, or of discrete actions. The time is the processor's, of training alone: no imports, set-up or tests.
 """
 import json
 import sys
@@ -106,8 +105,9 @@ def tianshou(recipe, task, seed):
         ent_coef=ppo["entropy"],
         max_grad_norm=ppo["max_grad_norm"],
         action_space=env.action_space,
+        # The bounds that it would clip to are -1 and 1, whatever the task's are; the tasks clip by themselves.
         action_scaling=False,
-        action_bound_method="clip",
+        action_bound_method="",
         deterministic_eval=True,
         lr_scheduler=decay if adam.get("schedule") == "linear" else None,
     )

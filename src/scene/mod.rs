@@ -1,8 +1,10 @@
 //! Scenes as data: where people may walk, what stands there, and procedural makers.
 
+pub mod mesh;
 mod polygon;
 mod sparse;
 
+pub use mesh::{Material, TriMesh};
 pub use polygon::Polygon;
 pub use sparse::{Setting, SparseKind, SparseScenes};
 

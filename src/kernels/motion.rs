@@ -202,6 +202,7 @@ pub struct MotionEngine {
     regressor: Regressor,
     hash: String,
     origin: Origin,
+    planted: bool,
 }
 
 impl MotionEngine {
@@ -212,7 +213,7 @@ impl MotionEngine {
     pub fn new(weights: &MotionWeights) -> Result<Self> {
         let decoder = Decoder::new(&weights.predictor)?;
         let regressor = Regressor::new(&weights.regressor)?;
-        Ok(Self { decoder, regressor, hash: weights.hash.clone(), origin: weights.config.canonical })
+        Ok(Self { decoder, regressor, hash: weights.hash.clone(), origin: weights.config.canonical, planted: weights.config.planted })
     }
 
     /// Reads a motion-model folder.
@@ -243,6 +244,10 @@ impl MotionModel for MotionEngine {
 
     fn origin(&self) -> Origin {
         self.origin
+    }
+
+    fn planted(&self) -> bool {
+        self.planted
     }
 }
 

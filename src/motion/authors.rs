@@ -7,7 +7,8 @@
 //! Files: predictor `epoch-400.ckp` and regressor `epoch-100.ckp`, {epoch, model_state_dict, optimizer_state_dict}. A regressor belongs
 //! to the body of one gender; it must give rotations in continuous form (159 numbers a body).
 
-use super::weights::{MotionConfig, MotionWeights, Origin, PredictorSizes, PredictorWeights, RegressorSizes, RegressorWeights};
+use super::config::{MotionConfig, Origin, PredictorSizes, RegressorSizes};
+use super::weights::{MotionWeights, PredictorWeights, RegressorWeights};
 use crate::body::{BETAS, BodyModel, MARKER_DIM};
 use crate::io::Precision;
 use crate::{Error, Result, torch};

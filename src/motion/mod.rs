@@ -9,6 +9,7 @@ pub mod canonical;
 pub mod clean;
 pub mod clip;
 pub mod cmu;
+mod config;
 pub mod dataset;
 pub mod footlock;
 #[cfg(test)]
@@ -29,6 +30,7 @@ pub mod retarget;
 pub mod samp;
 mod weights;
 
+pub use config::{CONTINUOUS, MotionConfig, Origin, PredictorSizes, RegressorSizes};
 pub use dataset::{BuildReport, build};
 pub use import::{ImportOptions, Recorded, import};
 pub use layers::{Dense, Gru, Named, Parameters};
@@ -36,10 +38,7 @@ pub use pose_prior::PosePrior;
 pub use predictor::Predictor;
 pub use primitive::{ClipMarkers, MotionSet};
 pub use regressor::Regressor;
-pub use weights::{
-    CONFIG_FILE, CONTINUOUS, MotionConfig, MotionWeights, Origin, PREDICTOR_FILE, PredictorSizes, PredictorWeights, REGRESSOR_FILE,
-    RegressorSizes, RegressorWeights,
-};
+pub use weights::{CONFIG_FILE, MotionWeights, PREDICTOR_FILE, PredictorWeights, REGRESSOR_FILE, RegressorWeights};
 
 use crate::Result;
 
@@ -72,5 +71,10 @@ pub trait MotionModel: Send + Sync {
     /// simulation's own are above the floor; it lowers and lifts what it exchanges with a model of the other kind.
     fn origin(&self) -> Origin {
         Origin::Floor
+    }
+
+    /// Whether the simulation carries the bodies it makes by the foot that bears them, see [`crate::sim::Sim::step`].
+    fn planted(&self) -> bool {
+        false
     }
 }

@@ -28,138 +28,18 @@
 //!
 //! The 159 are: translation 3, 22 rotations x 6 (rows of a (3, 2) matrix, see `body::rotation`), hands 24.
 
+use super::config::{CONTINUOUS, MotionConfig, PredictorSizes, RegressorSizes};
 use super::layers::{Dense, Gru, Named, Parameters};
-use crate::body::{BETAS, BODY_JOINTS, MARKER_DIM};
 use crate::io::{Precision, Tensors, content_hash, pack_tensors, write_atomic};
 use crate::{Error, Result};
-use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-/// Floats of a body in the regressor's continuous form: translation 3, rotations 22 x 6, hands 24.
-pub const CONTINUOUS: usize = 3 + BODY_JOINTS * 6 + 24;
 /// File names of a motion-model folder.
 pub const CONFIG_FILE: &str = "motion.json";
 pub const PREDICTOR_FILE: &str = "predictor.safetensors";
 pub const REGRESSOR_FILE: &str = "regressor.safetensors";
-
-/// Sizes of the marker predictor; the defaults are the authors'.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PredictorSizes {
-    /// Floats of a frame of markers.
-    pub frame: usize,
-    /// GRU states and the narrow layers.
-    pub hidden: usize,
-    /// The first layer of each MLP.
-    pub wide: usize,
-    /// Latent dimensions.
-    pub latent: usize,
-}
-
-impl PredictorSizes {
-    /// The sizes of a predictor whose tensors are `t`; [`PredictorWeights::read`] then checks every tensor against them.
-    ///
-    /// # Errors
-    /// Names the tensor that is missing.
-    pub fn of(t: &Tensors) -> Result<Self> {
-        let input = t.shape("x_enc.weight_ih_l0")?;
-        Ok(Self {
-            frame: input.get(1).copied().unwrap_or(0),
-            hidden: input.first().copied().unwrap_or(0) / 3,
-            wide: outputs(t, "e_mlp.layers.0")?,
-            latent: outputs(t, "e_mu")?,
-        })
-    }
-}
-
-/// Outputs of the dense layer `name`.
-fn outputs(t: &Tensors, name: &str) -> Result<usize> {
-    Ok(t.shape(&format!("{name}.bias"))?.first().copied().unwrap_or(0))
-}
-
-impl Default for PredictorSizes {
-    fn default() -> Self {
-        Self { frame: MARKER_DIM, hidden: 256, wide: 512, latent: super::LATENT }
-    }
-}
-
-/// Sizes of the body regressor; the defaults are the authors'.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RegressorSizes {
-    /// Width of the residual network.
-    pub width: usize,
-    /// Residual blocks of two layers.
-    pub blocks: usize,
-    /// Passes, each refining the estimate of the one before.
-    pub passes: usize,
-}
-
-impl Default for RegressorSizes {
-    fn default() -> Self {
-        Self { width: 128, blocks: 10, passes: 3 }
-    }
-}
-
-impl RegressorSizes {
-    /// Floats of the network's input: markers, betas, the current estimate.
-    pub const INPUT: usize = MARKER_DIM + BETAS + CONTINUOUS;
-
-    /// The sizes of a regressor whose tensors are `t`; its passes, which no tensor tells, are the authors'.
-    ///
-    /// # Errors
-    /// Names the tensor that is missing.
-    pub fn of(t: &Tensors) -> Result<Self> {
-        let names = t.names();
-        let has = |i: &usize| names.contains(&format!("pnet.layers.{i}.layers.0.weight"));
-        Ok(Self { width: outputs(t, "pnet.in_fc")?, blocks: (0..).take_while(has).count(), ..Self::default() })
-    }
-}
-
-/// Where canonical frames have their origin.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Origin {
-    /// On the floor below the pelvis of the first frame, so that heights are absolute.
-    #[default]
-    Floor,
-    /// At that pelvis itself, as in the authors' code.
-    Pelvis,
-}
-
-/// Content of `motion.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct MotionConfig {
-    /// Frames per second; 40.
-    pub fps: f32,
-    /// Frames of a primitive, seed included; 20.
-    pub frames: usize,
-    /// Where the canonical frames that the model has learned have their origin.
-    pub canonical: Origin,
-    /// Sizes of the predictor.
-    pub predictor: PredictorSizes,
-    /// Sizes of the regressor.
-    pub regressor: RegressorSizes,
-    /// Content hash of the body asset whose markers were learned.
-    pub body: String,
-}
-
-impl MotionConfig {
-    /// The paper's sizes on the body with content hash `body`.
-    pub fn new(body: impl Into<String>) -> Self {
-        Self {
-            fps: super::FPS,
-            frames: super::FRAMES,
-            canonical: Origin::Floor,
-            predictor: PredictorSizes::default(),
-            regressor: RegressorSizes::default(),
-            body: body.into(),
-        }
-    }
-}
 
 /// All weights of the marker predictor.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -301,7 +181,7 @@ impl MotionWeights {
         let path = dir.join(CONFIG_FILE);
         let text = config;
         let config: MotionConfig = serde_json::from_slice(&text).map_err(|e| Error::file(&path, e.to_string()))?;
-        check(&path, &config)?;
+        config.check(&path)?;
         let p = Tensors::from_bytes(dir.join(PREDICTOR_FILE), predictor)?;
         let r = Tensors::from_bytes(dir.join(REGRESSOR_FILE), regressor)?;
         let hash = content_hash([content_hash(&text), p.hash(), r.hash()].concat().as_bytes());
@@ -333,23 +213,10 @@ impl MotionWeights {
     }
 }
 
-fn check(path: &Path, c: &MotionConfig) -> Result<()> {
-    let bad = |key: &str, value: String, want: String| Err(Error::file(path, format!("{key} is {value}, expected {want}")));
-    if c.fps != super::FPS {
-        return bad("fps", c.fps.to_string(), super::FPS.to_string());
-    }
-    if c.frames != super::FRAMES {
-        return bad("frames", c.frames.to_string(), super::FRAMES.to_string());
-    }
-    if c.predictor.frame != MARKER_DIM {
-        return bad("predictor.frame", c.predictor.frame.to_string(), MARKER_DIM.to_string());
-    }
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::body::MARKER_DIM;
 
     #[test]
     fn folder_round_trip_and_checks() {

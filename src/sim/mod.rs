@@ -1,6 +1,7 @@
 //! Many people stepped together: latent actions in, 20 frames and the next state out. No reward, no learning.
 
 mod people;
+mod plant;
 mod seed;
 mod step;
 mod world;

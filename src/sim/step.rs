@@ -1,10 +1,13 @@
 //! One step of the simulated people: a primitive of 20 frames from two seed frames and a latent.
 
 use super::people::{JOINT_DIM, PersonMut};
+use super::plant::plant;
 use super::{People, Primitives};
 use crate::body::{BETAS, BodyModel, MARKER_DIM, PARAMS, POSE, ShapedBody, TRANSL};
+use crate::motion::clip::Skeleton;
 use crate::motion::{FRAMES, FUTURE, MotionModel, Origin, SEED};
 use crate::{Error, Result};
+use glam::Vec2;
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex};
 
@@ -15,6 +18,8 @@ const CHUNK: usize = 4;
 pub struct Sim {
     body: Arc<BodyModel>,
     model: Arc<dyn MotionModel>,
+    /// The mean body's soles, for models that want feet planted.
+    soles: Option<Skeleton>,
     /// Buffers between steps; a step takes one and puts it back, so steps may run side by side.
     spare: Mutex<Vec<Buffers>>,
 }
@@ -33,7 +38,8 @@ struct Buffers {
 impl Sim {
     /// People with `body`, moved by `model`.
     pub fn new(body: Arc<BodyModel>, model: Arc<dyn MotionModel>) -> Self {
-        Self { body, model, spare: Mutex::default() }
+        let soles = model.planted().then(|| Skeleton::new(&body));
+        Self { body, model, soles, spare: Mutex::default() }
     }
 
     /// The body everybody has, up to shape.
@@ -51,8 +57,10 @@ impl Sim {
     /// 1. Decode 18 frames of markers, regress their bodies (in canonical frames of the model's own origin), prepend the 2 seed bodies.
     /// 2. Smooth the seam: of frames 2 and 3 (from 0), parameters from index 6 on become the mean of their two neighbours,
     ///    both from the values before smoothing.
-    /// 3. New markers = 0.5 x skinned + 0.5 x predicted.
-    /// 4. The last two frames, in the canonical frame of the first of them, become the next seed in `people`.
+    /// 3. If the model asks for it ([`MotionModel::planted`]), let standing feet stand: move the bodies in the plane against the slip
+    ///    of the foot that bears them, and the legs so that standing feet keep place and heading.
+    /// 4. New markers = 0.5 x skinned + 0.5 x predicted (moved as the body was).
+    /// 5. The last two frames, in the canonical frame of the first of them, become the next seed in `people`.
     ///
     /// Sizes that do not fit and results that are not finite are refused (naming the person), with `people` as they were.
     pub fn step(&self, people: &mut People, latents: &[f32], out: &mut Primitives) -> Result<()> {
@@ -115,12 +123,11 @@ impl Sim {
             old.copy_from_slice(&people.params[i * SEED * PARAMS..][..SEED * PARAMS]);
             new.copy_from_slice(&b.regressed[i * FUTURE * PARAMS..][..FUTURE * PARAMS]);
             smooth_seam(params);
+            let moved = self.soles.as_ref().map(|soles| plant(soles, &body, &mut params[(SEED - 1) * PARAMS..]));
             let (old, new) = markers.split_at_mut(SEED * MARKER_DIM);
             old.copy_from_slice(&people.markers[i * SEED * MARKER_DIM..][..SEED * MARKER_DIM]);
             pose_frames(&body, params, new, joints, views);
-            for (m, p) in new.iter_mut().zip(&b.predicted[i * FUTURE * MARKER_DIM..]) {
-                *m = 0.5 * (*m + p);
-            }
+            blend(new, &b.predicted[i * FUTURE * MARKER_DIM..], moved.as_deref());
         });
     }
 
@@ -159,6 +166,16 @@ fn shift(people: &People, sign: f32, data: &mut [f32], each: usize, stride: usiz
     for (i, data) in data.chunks_exact_mut(each).enumerate() {
         let height = sign * people.pelvis_height(i);
         data.iter_mut().skip(at).step_by(stride).for_each(|z| *z += height);
+    }
+}
+
+/// Half the skinned markers `new` (18 x 201), half the predicted ones, moved in the plane as their bodies were.
+fn blend(new: &mut [f32], predicted: &[f32], moved: Option<&[Vec2]>) {
+    for (t, (new, predicted)) in new.chunks_exact_mut(MARKER_DIM).zip(predicted.chunks_exact(MARKER_DIM)).enumerate() {
+        let by = moved.map_or(Vec2::ZERO, |m| m[t]).extend(0.0).to_array();
+        for (k, (m, p)) in new.iter_mut().zip(predicted).enumerate() {
+            *m = 0.5 * (*m + (p + by[k % 3]));
+        }
     }
 }
 

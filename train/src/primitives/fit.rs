@@ -105,8 +105,8 @@ impl<'a> Run<'a> {
     /// Takes the networks of the motion-model folder `dir` instead of fresh ones, to train them further on other data or losses.
     pub fn start_from(mut self, dir: &Path) -> Result<Self> {
         let w = MotionWeights::load(dir)?;
-        let c = MotionConfig::new(self.model.hash());
-        if w.config != c {
+        let c = self.config();
+        if (MotionConfig { planted: c.planted, ..w.config.clone() }) != c {
             return Err(Error::file(dir, format!("holds a model of {:?}, expected {c:?}", w.config)).into());
         }
         (self.predictor.weights, self.regressor.weights) = (w.predictor, w.regressor);
@@ -272,8 +272,12 @@ impl<'a> Run<'a> {
         let place = serde_json::to_string(&self.place).map_err(|e| Error::invalid(e.to_string()))?;
         let metadata = BTreeMap::from([("place".to_string(), place)]);
         write_atomic(self.out.join(STATE), &pack_tensors(&tensors, &metadata, Precision::Full)?)?;
-        MotionWeights::save(&self.out, &MotionConfig::new(self.model.hash()), &self.predictor.weights, &self.regressor.weights)?;
+        MotionWeights::save(&self.out, &self.config(), &self.predictor.weights, &self.regressor.weights)?;
         Ok(())
+    }
+
+    fn config(&self) -> MotionConfig {
+        MotionConfig { planted: self.place.settings.planted, ..MotionConfig::new(self.model.hash()) }
     }
 
     /// The folder that the run writes.

@@ -5,7 +5,7 @@ use crate::recipe::changed;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// The recipe of the shipped model.
+/// The recipe that comes with the program.
 const EMBEDDED: &str = include_str!("../../recipes/motion/default.toml");
 
 /// What a run does; the whole of it is kept in its checkpoints.
@@ -32,6 +32,9 @@ pub struct Settings {
     /// How strongly rare manoeuvres are favoured: a manoeuvre seen n times is drawn as if seen n^(1 - this) times. Recorded people
     /// mostly go on as they are; a prior that does so too can hardly be steered.
     pub favour: f32,
+    /// Whether the simulation is to carry bodies by the foot that bears them; no part of the training.
+    #[serde(default)]
+    pub planted: bool,
     /// Weights of the predictor's loss.
     pub loss: LossWeights,
 }

@@ -6,10 +6,12 @@ mod model;
 pub mod rotation;
 mod shaped;
 pub(crate) mod smplx;
+mod surface;
 
 pub use frame::{Frame, canonical_frame};
 pub use model::BodyModel;
 pub use shaped::{Posed, ShapedBody, local_rotations};
+pub use surface::{Inside, Points, ShapedSurface, Surface};
 
 use crate::{Error, Result};
 use std::ops::Range;

@@ -203,6 +203,7 @@ pub struct MotionEngine {
     hash: String,
     origin: Origin,
     planted: bool,
+    active: Vec<usize>,
 }
 
 impl MotionEngine {
@@ -213,7 +214,9 @@ impl MotionEngine {
     pub fn new(weights: &MotionWeights) -> Result<Self> {
         let decoder = Decoder::new(&weights.predictor)?;
         let regressor = Regressor::new(&weights.regressor)?;
-        Ok(Self { decoder, regressor, hash: weights.hash.clone(), origin: weights.config.canonical, planted: weights.config.planted })
+        let config = &weights.config;
+        let active = active(&weights.predictor);
+        Ok(Self { decoder, regressor, hash: weights.hash.clone(), origin: config.canonical, planted: config.planted, active })
     }
 
     /// Reads a motion-model folder.
@@ -223,6 +226,16 @@ impl MotionEngine {
     pub fn load(dir: impl AsRef<Path>) -> Result<Self> {
         Self::new(&MotionWeights::load(dir)?)
     }
+}
+
+/// The latent's dimensions by the length of their columns in the decoder's cell: training leaves those alone that it finds no use for.
+fn active(w: &PredictorWeights) -> Vec<usize> {
+    let (cell, first, latent) = (&w.d_rnn, w.x_enc.hidden, w.e_mu.output);
+    let square = |k: usize| cell.weight_ih.chunks_exact(cell.input).map(|row| row[first + k].powi(2)).sum::<f32>();
+    let squares: Vec<f32> = (0..latent).map(square).collect();
+    let mut order: Vec<usize> = (0..latent).collect();
+    order.sort_by(|&a, &b| squares[b].total_cmp(&squares[a]));
+    order
 }
 
 impl MotionModel for MotionEngine {
@@ -244,6 +257,10 @@ impl MotionModel for MotionEngine {
 
     fn origin(&self) -> Origin {
         self.origin
+    }
+
+    fn active(&self) -> Vec<usize> {
+        self.active.clone()
     }
 
     fn planted(&self) -> bool {

@@ -73,6 +73,11 @@ pub trait MotionModel: Send + Sync {
         Origin::Floor
     }
 
+    /// The latent's dimensions, those that move people most first.
+    fn active(&self) -> Vec<usize> {
+        (0..self.latent_dim()).collect()
+    }
+
     /// Whether the simulation carries the bodies it makes by the foot that bears them, see [`crate::sim::Sim::step`].
     fn planted(&self) -> bool {
         false

@@ -20,6 +20,8 @@ pub struct Sim {
     model: Arc<dyn MotionModel>,
     /// The mean body's soles, for models that want feet planted.
     soles: Option<Skeleton>,
+    /// See [`MotionModel::active`].
+    active: Vec<usize>,
     /// Buffers between steps; a step takes one and puts it back, so steps may run side by side.
     spare: Mutex<Vec<Buffers>>,
 }
@@ -39,7 +41,8 @@ impl Sim {
     /// People with `body`, moved by `model`.
     pub fn new(body: Arc<BodyModel>, model: Arc<dyn MotionModel>) -> Self {
         let soles = model.planted().then(|| Skeleton::new(&body));
-        Self { body, model, soles, spare: Mutex::default() }
+        let active = model.active();
+        Self { body, model, soles, active, spare: Mutex::default() }
     }
 
     /// The body everybody has, up to shape.
@@ -50,6 +53,22 @@ impl Sim {
     /// The motion model.
     pub fn model(&self) -> &Arc<dyn MotionModel> {
         &self.model
+    }
+
+    /// Whole latents from their `k` most active dimensions, the others 0. `latents`: n x k; returns n x latent_dim.
+    ///
+    /// # Errors
+    /// If the model has not that many.
+    pub fn widen(&self, latents: &[f32], k: usize) -> Result<Vec<f32>> {
+        let dim = self.active.len();
+        if k == 0 || k > dim {
+            return Err(Error::invalid(format!("actions of {k} latents, the motion model has {dim}")));
+        }
+        let mut wide = vec![0.0; latents.len() / k * dim];
+        for (from, to) in latents.chunks_exact(k).zip(wide.chunks_exact_mut(dim)) {
+            from.iter().zip(&self.active).for_each(|(v, &at)| to[at] = *v);
+        }
+        Ok(wide)
     }
 
     /// Moves everybody by one primitive of 20 frames, 18 of them new. `latents`: n x latent_dim.

@@ -251,3 +251,37 @@ fn models_whose_frames_start_at_the_pelvis_give_the_same() {
     assert!(near(&x.markers, &y.markers) && near(&x.params, &y.params) && near(&x.joints, &y.joints));
     assert!(near(&a.markers, &b.markers) && near(&a.params, &b.params));
 }
+
+#[test]
+fn few_latents_go_to_the_most_active() {
+    let (people, body, model) = walkers(1, Frame::IDENTITY);
+    drop(people);
+    let sim = Sim::new(body, Arc::new(model));
+    // Two dimensions, in order.
+    assert_eq!(sim.widen(&[3.0, 4.0], 1).unwrap(), [3.0, 0.0, 4.0, 0.0]);
+    assert_eq!(sim.widen(&[3.0, 4.0], 2).unwrap(), [3.0, 4.0]);
+    for k in [0, 3] {
+        assert!(sim.widen(&[], k).unwrap_err().to_string().contains("has 2"));
+    }
+}
+
+#[test]
+fn the_shipped_models_active_dimensions_are_those_that_move() {
+    let world = crate::sim::World::embedded().unwrap();
+    let sim = &world.sim;
+    let dim = sim.model().latent_dim();
+    // How far markers go when one dimension alone is 2.
+    let reach = |rank: usize| {
+        let mut people = People::new(1);
+        people.place(0, sim.body(), &world.train.seeds[0], 0.0, 0.0, 0.0).unwrap();
+        let (mut still, mut moved) = (vec![0.0; FUTURE * MARKER_DIM], vec![0.0; FUTURE * MARKER_DIM]);
+        let mut one = vec![0.0; dim];
+        one[rank] = 2.0;
+        let latent = sim.widen(&one, dim).unwrap();
+        sim.model().decode(&people.markers, &vec![0.0; dim], &mut still).unwrap();
+        sim.model().decode(&people.markers, &latent, &mut moved).unwrap();
+        still.iter().zip(&moved).map(|(a, b)| (a - b).abs()).sum::<f32>() / still.len() as f32
+    };
+    let (first, last): (f32, f32) = ((0..4).map(reach).sum(), (dim - 40..dim).map(reach).sum());
+    assert!(first / 4.0 > 10.0 * last / 40.0, "{first} {last}");
+}

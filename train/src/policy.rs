@@ -35,6 +35,11 @@ enum Acting {
 }
 
 impl Policy {
+    /// Numbers of an action.
+    pub fn actions(&self) -> usize {
+        self.spec.action.count()
+    }
+
     /// The policy with these flat parameters.
     pub fn new(spec: &PolicySpec, params: &[f32], compute: &Compute) -> Result<Self> {
         let acting = match compute {

@@ -47,6 +47,8 @@ pub struct MotionTask {
     pub scene: SparseScenes,
     pub weights: Weights,
     pub pose: PoseCheck,
+    /// Act through that many latents, those that move people most, and leave the others 0; absent: all of them, as published.
+    pub latents: Option<usize>,
     /// Steps (of 0.45 s) after which an episode ends. The observation shows the time, so this is a termination.
     pub max_depth: u32,
     /// People start facing the goal but for a turn of up to this, degrees either way.
@@ -65,6 +67,7 @@ impl Default for MotionTask {
             scene: SparseScenes::default(),
             weights: Weights::default(),
             pose: PoseCheck::default(),
+            latents: None,
             max_depth: 11,
             yaw_noise_deg: 36.0,
             success_distance: 0.1,
@@ -86,6 +89,7 @@ impl MotionTask {
             need(weight.is_finite(), &format!("weights.{}", term.name), "a finite number")?;
         }
         need(self.pose.threshold.is_none_or(|t| t > 0.0 && t.is_finite()), "pose.threshold", "more than 0")?;
+        need(self.latents != Some(0), "latents", "1 or more")?;
         need((1..=1000).contains(&self.max_depth), "max_depth", "1 to 1000 steps")?;
         need((0.0..=180.0).contains(&self.yaw_noise_deg), "yaw_noise_deg", "0 to 180 degrees")?;
         need(self.success_distance > 0.0 && self.success_distance <= 1.0, "success_distance", "more than 0, at most 1 m")?;
@@ -111,6 +115,7 @@ mod tests {
     fn unusable_values_are_named() {
         for (text, key) in [
             (r#"{"max_depth": 0}"#, "max_depth"),
+            (r#"{"latents": 0}"#, "latents"),
             (r#"{"yaw_noise_deg": -1.0}"#, "yaw_noise_deg"),
             (r#"{"success_distance": 0.0}"#, "success_distance"),
             (r#"{"blocked_cells": 0}"#, "blocked_cells"),

@@ -31,7 +31,7 @@ pub enum Starts {
 /// Observation: "state" [2, 402] (per seed frame 67 markers, then 67 unit vectors from marker to goal; canonical frame with the origin of
 /// the motion model's),
 /// "egosensing" [2, 32] (see [`egogen::sensing::look`]), "dist" [1] = 1 / (1 + d), "time" [1] = 1 - steps / max_depth.
-/// Action: the latent of the motion model, unbounded. Info: the weighted reward terms. Episodes end on success, on
+/// Action: the latent of the motion model or its most active dimensions (`latents`), unbounded. Info: the weighted reward terms. Episodes end on success, on
 /// penetration and at the step limit (all of them terminations). Figures of an episode: see [`EPISODE`].
 pub struct MotionEnv {
     spec: EnvSpec,
@@ -100,7 +100,11 @@ impl MotionEnv {
         if bank.seeds.is_empty() {
             return Err(EnvError::Invalid("the seed bank is empty, expected at least one seed motion".into()));
         }
-        let spec = spec(sim.model().latent_dim());
+        let dim = sim.model().latent_dim();
+        if let Some(k) = task.latents.filter(|&k| k > dim) {
+            return Err(EnvError::Invalid(format!("latents is {k}, expected at most the motion model's {dim}")));
+        }
+        let spec = spec(task.latents.unwrap_or(dim));
         let state = State { seed, people: People::new(n), members: vec![Member::default(); n] };
         let judge = PoseJudge::new(&task)?;
         let mut env = Self { spec, task, own: Vec::new(), starts, sim, bank, judge, state, prims: Primitives::default() };
@@ -226,7 +230,10 @@ impl VecEnv for MotionEnv {
     fn step(&mut self, actions: &[f32], out: &mut StepResult) -> Result<(), EnvError> {
         self.spec.check_actions(self.num_envs(), actions)?;
         out.prepare(&self.spec, self.num_envs());
-        self.sim.step(&mut self.state.people, actions, &mut self.prims)?;
+        match self.task.latents {
+            Some(k) => self.sim.step(&mut self.state.people, &self.sim.widen(actions, k)?, &mut self.prims)?,
+            None => self.sim.step(&mut self.state.people, actions, &mut self.prims)?,
+        }
         let ended = self.judge(out)?;
         self.write_obs(&mut out.final_obs);
         out.obs.copy_from_slice(&out.final_obs);

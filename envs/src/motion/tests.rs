@@ -56,6 +56,20 @@ fn conforms() {
 }
 
 #[test]
+fn few_latents_act_like_whole_ones_with_zeros() {
+    let few = MotionTask { latents: Some(2), ..MotionTask::default() };
+    check(|n, seed| Box::new(env(few.clone(), n, seed)), Effort { steps: 15, action_scale: 1.0 });
+    let (mut a, mut b) = (env(few.clone(), 2, 5), env(MotionTask::default(), 2, 5));
+    let (mut x, mut y) = (StepResult::default(), StepResult::default());
+    a.step(&[1.0, 0.2, 0.5, -0.1], &mut x).unwrap();
+    b.step(&[1.0, 0.2, 0.0, 0.0, 0.5, -0.1, 0.0, 0.0], &mut y).unwrap();
+    assert_eq!((x.obs, x.reward), (y.obs, y.reward));
+    let (sim, bank) = world();
+    let error = MotionEnv::new(MotionTask { latents: Some(5), ..few }, sim, bank, 1, 0).err().unwrap().to_string();
+    assert!(error.contains("latents is 5, expected at most the motion model's 4"), "{error}");
+}
+
+#[test]
 fn the_spec_is_the_papers() {
     let env = env(MotionTask::default(), 1, 0);
     let groups: Vec<_> = env.spec().obs.iter().map(|g| (g.name.as_str(), g.shape.clone())).collect();

@@ -42,6 +42,7 @@ impl Actor {
     pub fn policy(bundle: &Bundle, env: &MotionEnv, noise: bool) -> Result<Self> {
         bundle.require("motion", env.sim().model().hash())?;
         bundle.require("body", env.sim().body().hash())?;
+        env.sim().widen(&[], bundle.spec.action.count())?;
         Ok(Self::Policy { policy: Box::new(Policy::new(&bundle.spec, &bundle.params, &Compute::Own)?), noise })
     }
 
@@ -52,11 +53,12 @@ impl Actor {
         match self {
             Self::Policy { policy, noise } => {
                 let acts = policy.act(obs)?;
-                let rows = || acts.mu.chunks_exact(dim).zip(acts.logvar.chunks_exact(dim));
+                let k = policy.actions();
+                let rows = || acts.mu.chunks_exact(k).zip(acts.logvar.chunks_exact(k));
                 Ok(Choice {
-                    kl: rows().map(|(mu, logvar)| kl_to_standard(mu, logvar) / dim as f32).collect(),
+                    kl: rows().map(|(mu, logvar)| kl_to_standard(mu, logvar) / k as f32).collect(),
                     kl_mean: rows().map(|(mu, _)| kl_mean_only(mu)).collect(),
-                    latents: if *noise { acts.sample(seed, NOISE, step) } else { acts.mu },
+                    latents: env.sim().widen(&if *noise { acts.sample(seed, NOISE, step) } else { acts.mu }, k)?,
                 })
             }
             Self::Zero => Ok(Choice { latents: vec![0.0; people.len() * dim], ..Default::default() }),

@@ -176,19 +176,25 @@ pub fn pack_tensors(
     metadata: &BTreeMap<String, String>,
     precision: Precision,
 ) -> Result<Vec<u8>> {
-    let raw: Vec<Vec<u8>> = tensors
-        .iter()
-        .map(|(_, _, data)| match precision {
-            Precision::Full => data.iter().flat_map(|v| v.to_le_bytes()).collect(),
-            Precision::Half => data.iter().flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect(),
-        })
-        .collect();
+    let bytes = |data: &[f32]| match precision {
+        Precision::Full => data.iter().flat_map(|v| v.to_le_bytes()).collect(),
+        Precision::Half => data.iter().flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect(),
+    };
     let dtype = if precision == Precision::Full { Dtype::F32 } else { Dtype::F16 };
+    let raw: Vec<RawTensor> = tensors.iter().map(|(name, shape, data)| (name.as_str(), dtype, shape.clone(), bytes(data))).collect();
+    pack_raw(&raw, metadata)
+}
+
+/// Name, type, shape and little-endian elements of a tensor.
+pub(crate) type RawTensor<'a> = (&'a str, Dtype, Vec<usize>, Vec<u8>);
+
+/// Packs tensors of any type and metadata into safetensors bytes.
+pub(crate) fn pack_raw(tensors: &[RawTensor], metadata: &BTreeMap<String, String>) -> Result<Vec<u8>> {
     let mut views = BTreeMap::new();
-    for ((name, shape, _), bytes) in tensors.iter().zip(&raw) {
-        let view =
-            TensorView::new(dtype, shape.clone(), bytes).map_err(|e| Error::invalid(format!("tensor '{name}' of shape {shape:?}: {e}")))?;
-        views.insert(name.clone(), view);
+    for (name, dtype, shape, bytes) in tensors {
+        let view = TensorView::new(*dtype, shape.clone(), bytes)
+            .map_err(|e| Error::invalid(format!("tensor '{name}' of shape {shape:?}: {e}")))?;
+        views.insert(name.to_string(), view);
     }
     // The header's map is written in one order only when it holds one entry, so all metadata travels as one JSON text.
     let info = (!metadata.is_empty()).then(|| [("egogen".to_string(), serde_json::json!(metadata).to_string())].into_iter().collect());

@@ -168,6 +168,19 @@ pub(crate) fn parse_npy(bytes: &[u8]) -> std::result::Result<Npy<'_>, String> {
     Ok((dtype, dims.collect::<std::result::Result<_, _>>()?, after("'fortran_order':")?.starts_with("True"), data))
 }
 
+/// The numbers of an `.npy` file; `path` names it in errors.
+pub(crate) fn read_npy(path: &Path, bytes: &[u8]) -> Result<Array> {
+    parse_npy(bytes).and_then(|(dtype, shape, fortran, data)| Array::decode(&dtype, shape, fortran, data)).map_err(|e| Error::file(path, e))
+}
+
+/// The `.npy` form of an array: its header as NumPy pads it, to a multiple of 64 with a newline at its end, and its elements.
+pub(crate) fn npy(descr: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
+    let dict = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {}, }}", show(shape));
+    let padded = (MAGIC.len() + 4 + dict.len() + 1).next_multiple_of(64) - MAGIC.len() - 4;
+    let header = format!("{dict:<width$}\n", width = padded - 1);
+    [MAGIC, &[1, 0], &(padded as u16).to_le_bytes(), header.as_bytes(), data].concat()
+}
+
 /// An `.npz` archive; entries are read when asked for, so that others may hold anything.
 pub(crate) struct Npz<'a> {
     path: PathBuf,
@@ -236,12 +249,8 @@ impl NpzWriter {
         self.entry(key, &format!("<U{}", bytes.len() / 4), &[], &bytes);
     }
 
-    /// The header as NumPy pads it: to a multiple of 64 with a newline at its end.
     fn entry(&mut self, key: &str, descr: &str, shape: &[usize], data: &[u8]) {
-        let dict = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': {}, }}", show(shape));
-        let padded = (MAGIC.len() + 4 + dict.len() + 1).next_multiple_of(64) - MAGIC.len() - 4;
-        let header = format!("{dict:<width$}\n", width = padded - 1);
-        self.0.push((format!("{key}.npy"), [MAGIC, &[1, 0], &(padded as u16).to_le_bytes(), header.as_bytes(), data].concat()));
+        self.0.push((format!("{key}.npy"), npy(descr, shape, data)));
     }
 
     /// The content of the file.

@@ -207,6 +207,33 @@ impl<'a> Pickle<'a> {
         array.map_err(|e| Error::file(&self.path, format!("'{key}' {e}")))
     }
 
+    /// What a value and the values in it hold as one array; `seen` counts them.
+    fn stacked(&self, id: Id, depth: usize, seen: &mut usize) -> std::result::Result<Array, String> {
+        *seen += 1;
+        if *seen > MAX_VALUES || depth > MAX_DEPTH {
+            return Err(format!("holds more than {MAX_VALUES} values, or lists deeper than {MAX_DEPTH}"));
+        }
+        let items = match &self.nodes[id] {
+            Node::Number(v) => return Ok(Array { shape: Vec::new(), data: vec![*v as f32] }),
+            Node::Array { dtype, shape, fortran, data } => {
+                let array = self.decode(*dtype, *shape, *fortran, *data)?;
+                *seen += array.data.len();
+                return Ok(array);
+            }
+            Node::List(items) | Node::Tuple(items) => items,
+            _ => return Err("holds something else than arrays, lists and numbers".into()),
+        };
+        let parts = items.iter().map(|&i| self.stacked(i, depth + 1, seen)).collect::<std::result::Result<Vec<_>, _>>()?;
+        let first = parts.first().map_or(Vec::new(), |p| p.shape.clone());
+        match parts.iter().find(|p| p.shape != first) {
+            Some(p) => Err(format!("holds arrays of shapes {first:?} and {:?} in one list", p.shape)),
+            None => Ok(Array {
+                shape: std::iter::once(parts.len()).chain(first).collect(),
+                data: parts.into_iter().flat_map(|p| p.data).collect(),
+            }),
+        }
+    }
+
     fn decode(&self, dtype: Id, shape: Id, fortran: bool, data: Id) -> std::result::Result<Array, String> {
         let Node::Dtype { name, big } = self.nodes[dtype] else { return Err("has no element type".into()) };
         let dtype = Dtype::parse(name).ok_or_else(|| format!("has elements of type '{name}', expected numbers"))?;
@@ -220,6 +247,14 @@ impl<'a> Pickle<'a> {
         };
         Array::decode(&Dtype { big, ..dtype }, shape, fortran, &bytes)
     }
+}
+
+/// The numbers of a pickle that is an array, or a list or tuple of such or of numbers, all of one shape.
+pub(crate) fn nested(path: &Path, bytes: &[u8]) -> Result<Array> {
+    let (machine, root) = Machine::run(path, bytes, false)?;
+    let pickle = Pickle { path: path.into(), nodes: machine.nodes, items: Vec::new() };
+    let mut seen = 0;
+    pickle.stacked(root, 0, &mut seen).map_err(|e| Error::file(path, e))
 }
 
 /// The whole numbers of a tuple.

@@ -8,6 +8,8 @@ mod font;
 mod image;
 mod intersect;
 mod mesh;
+mod plan;
+mod relief;
 mod stage;
 mod top_view;
 
@@ -17,6 +19,7 @@ pub use episode::{Episode, Walker};
 pub use film::{film, tile};
 pub use image::{Image, Rgb, ramp};
 pub use mesh::Mesh;
+pub use plan::ScenePlan;
 pub use stage::{Hit, Shading, Stage, TracedStage};
 pub use top_view::TopView;
 

@@ -109,6 +109,32 @@ impl TopView {
         self.canvas.text(at, text, LABEL, colour::INK);
     }
 
+    /// Side of a pixel, metres.
+    pub fn metres(&self) -> f32 {
+        1.0 / self.scale
+    }
+
+    /// Lays a colour with this opacity over all pixels whose middle `covers` says yes to, metres.
+    pub fn tint(&mut self, colour: Rgb, opacity: f32, covers: impl Fn(Vec2) -> bool) {
+        let [width, height] = self.size();
+        for (x, y) in (0..height).flat_map(|y| (0..width).map(move |x| (x, y))) {
+            let right = Vec2::new(x as f32 + 0.5 - MARGIN, height as f32 - 2.0 * MARGIN - y as f32 - 0.5);
+            if covers(self.low + right / self.scale) {
+                self.canvas.image.blend(x as i64, y as i64, colour, opacity);
+            }
+        }
+    }
+
+    /// Width and height of the image, pixels.
+    pub(super) fn size(&self) -> [usize; 2] {
+        [self.canvas.image.width, self.canvas.image.height]
+    }
+
+    /// What has been drawn so far.
+    pub(super) fn image(&mut self) -> &mut Image {
+        &mut self.canvas.image
+    }
+
     /// The finished image.
     pub fn finish(self) -> Image {
         self.canvas.image

@@ -1,12 +1,25 @@
 //! Scenes as data: where people may walk, what stands there, and procedural makers.
 
+mod grid;
 pub mod mesh;
+mod outline;
+mod pairs;
+mod paths;
 mod polygon;
+mod rings;
+pub mod rooms;
 mod sparse;
+mod walkable;
 
+pub use grid::Grid;
 pub use mesh::{Material, TriMesh};
+pub use outline::{navmesh_polygon, read_polygon};
+pub use pairs::{Pair, PairOptions, read_pairs, write_pairs};
+pub use paths::{Navigator, Route};
 pub use polygon::Polygon;
+pub use rooms::{Room, RoomKind, Rooms, Split};
 pub use sparse::{Setting, SparseKind, SparseScenes};
+pub use walkable::{Walkable, WalkableOptions, floor_height};
 
 use glam::{DVec2, Vec2};
 use serde::{Deserialize, Serialize};

@@ -1,5 +1,6 @@
 //! A walkable region: a polygon with holes on the ground plane, in f64.
 
+use super::rings::{ring_edges, segment_distance, signed_area};
 use crate::body::Frame;
 use crate::{Error, Result};
 use glam::{DVec2, Vec2, Vec3};
@@ -26,7 +27,7 @@ impl Polygon {
             if let Some(p) = ring.iter().find(|p| !p.is_finite()) {
                 return Err(Error::invalid(format!("{name} holds the point ({}, {}), expected finite numbers", p.x, p.y)));
             }
-            if area(ring) < 1e-9 {
+            if signed_area(ring).abs() < 1e-9 {
                 return Err(Error::invalid(format!("{name} encloses no area")));
             }
         }
@@ -87,30 +88,16 @@ impl Polygon {
         range(lo.y, hi.y).map(row).sum()
     }
 
-    fn edges(&self) -> impl Iterator<Item = (DVec2, DVec2)> {
+    /// The edges of all rings.
+    pub(crate) fn edges(&self) -> impl Iterator<Item = (DVec2, DVec2)> {
         self.rings().flat_map(|ring| ring_edges(ring))
     }
-}
-
-fn ring_edges(ring: &[DVec2]) -> impl Iterator<Item = (DVec2, DVec2)> {
-    let before = ring.iter().skip(ring.len() - 1).chain(ring);
-    before.zip(ring).map(|(&a, &b)| (a, b))
-}
-
-fn area(ring: &[DVec2]) -> f64 {
-    ring_edges(ring).map(|(a, b)| a.perp_dot(b)).sum::<f64>().abs() / 2.0
 }
 
 /// Crossing-number test.
 fn inside(ring: &[DVec2], p: DVec2) -> bool {
     let crosses = |(a, b): &(DVec2, DVec2)| (a.y > p.y) != (b.y > p.y) && p.x < (b.x - a.x) * (p.y - a.y) / (b.y - a.y) + a.x;
     ring_edges(ring).filter(crosses).count() % 2 == 1
-}
-
-fn segment_distance(a: DVec2, b: DVec2, p: DVec2) -> f64 {
-    let (along, to) = (b - a, p - a);
-    let t = (to.dot(along) / along.length_squared().max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
-    (to - t * along).length()
 }
 
 /// Solves origin + t dir = a + s (b - a); an edge parallel to the ray is met through its neighbours.

@@ -1,0 +1,77 @@
+//! Plans of scenes: what stands there, where people may walk, and ways.
+
+use super::{Image, Rgb, TopView, colour};
+use crate::Result;
+use crate::scene::{Grid, Polygon, TriMesh};
+use glam::{DVec2, Vec2};
+
+/// Laid over what can be walked on.
+const FREE: Rgb = [120, 190, 130];
+/// Metres round the scene.
+const BORDER: f32 = 0.3;
+
+/// A scene from above.
+pub struct ScenePlan<'a> {
+    /// What stands there; the picture shows the walkable area alone without it.
+    pub mesh: Option<&'a TriMesh>,
+    pub walkable: &'a Polygon,
+    /// Ways from starts to goals, metres.
+    pub ways: &'a [Vec<DVec2>],
+    /// Stands in the corner.
+    pub caption: &'a str,
+}
+
+impl ScenePlan<'_> {
+    /// The plan on an image `width` pixels wide.
+    pub fn draw(&self, width: usize) -> Result<Image> {
+        let (low, high) = self.walkable.bounds();
+        let mut view = TopView::new(low.as_vec2() - BORDER, high.as_vec2() + BORDER, width)?;
+        if let Some(mesh) = self.mesh {
+            let colours: Vec<Rgb> = mesh.materials.iter().map(|m| srgb(m.color)).collect();
+            let of = |i: usize| colours.get(usize::from(mesh.material[i])).copied().unwrap_or(colour::STONE);
+            view.relief((0..mesh.triangles.len()).map(|i| (mesh.corners(i), of(i))));
+        }
+        let grid = Grid::of_polygon(self.walkable, f64::from(view.metres()))?;
+        view.tint(FREE, 0.3, |p| grid.holds(p.as_dvec2()));
+        let rings: Vec<Vec<Vec2>> = self.walkable.rings().map(|r| r.iter().map(|p| p.as_vec2()).collect()).collect();
+        for ring in &rings {
+            let closed: Vec<Vec2> = ring.iter().chain(ring.first()).copied().collect();
+            view.path(&closed, 1.5, colour::GREEN);
+        }
+        for (way, colour) in self.ways.iter().zip(colour::PEOPLE.into_iter().cycle()) {
+            let way: Vec<Vec2> = way.iter().map(|p| p.as_vec2()).collect();
+            view.path(&way, 2.5, colour);
+            if let [start, .., goal] = way[..] {
+                view.start(start, colour);
+                view.goal(goal, 0.1, colour);
+            }
+        }
+        view.caption(self.caption);
+        Ok(view.finish())
+    }
+}
+
+/// A linear colour as 8-bit sRGB.
+fn srgb([r, g, b, _]: [f32; 4]) -> Rgb {
+    [r, g, b].map(|c| (255.0 * c.clamp(0.0, 1.0).powf(1.0 / 2.2)).round() as u8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Rooms;
+
+    #[test]
+    fn a_room_has_its_floor_and_its_furniture() {
+        let room = Rooms::default().draw(3).unwrap();
+        let ways = [vec![DVec2::ZERO, DVec2::ONE, DVec2::X]];
+        let plan = ScenePlan { mesh: Some(&room.mesh), walkable: &room.walkable, ways: &ways, caption: "ROOM 3" };
+        let image = plan.draw(320).unwrap();
+        let different: std::collections::BTreeSet<Rgb> = image.rgb.as_chunks::<3>().0.iter().copied().collect();
+        assert!(different.len() > 100, "{}", different.len());
+        let bare = ScenePlan { mesh: None, ways: &[], ..plan }.draw(320).unwrap();
+        let tinted = bare.rgb.as_chunks::<3>().0.iter().filter(|p| p[1] > p[0] && p[1] > p[2]).count();
+        assert!(tinted > 10_000, "{tinted}");
+        assert_eq!(srgb([0.0, 1.0, 0.5, 1.0]), [0, 255, 186]);
+    }
+}

@@ -14,6 +14,7 @@ use crate::body::smplx::parse;
 use crate::body::tests::few_vertices;
 use crate::io::numpy::{Array, Npz, parse_npy};
 use crate::io::zip::{Archive, pack};
+use crate::scene::mesh::{Format, MeshOptions};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use std::path::Path;
@@ -138,6 +139,18 @@ proptest! {
         for bytes in [pack(&entries), damaged(bytes.clone(), &changes)] {
             if let Err(error) = parse(Path::new("damaged.npz"), &bytes, &markers) {
                 prop_assert!(error.to_string().contains("damaged.npz"), "{error}");
+            }
+        }
+    }
+
+    /// Meshes; the undamaged files beside them stay within reach.
+    #[test]
+    fn damaged_meshes(changes in damage()) {
+        for name in ["table.obj", "cylinder.ply", "torus.ply", "wedge.ply", "tree.gltf", "scene.glb"] {
+            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/scenes").join(name);
+            match Format::of(&path).unwrap().parse(&path, &damaged(fixture(&format!("scenes/{name}")), &changes), &MeshOptions::default()) {
+                Ok(imported) => prop_assert!(imported.mesh.check().is_ok()),
+                Err(error) => prop_assert!(error.to_string().contains("scenes"), "{error}"),
             }
         }
     }

@@ -1,5 +1,14 @@
 //! Triangle meshes of rooms and what stands in them.
 
+mod gltf;
+mod import;
+mod obj;
+mod ply;
+
+#[cfg(test)]
+pub(crate) use import::Format;
+pub use import::{Imported, MAX_TRIANGLES, MeshOptions, Up, read_mesh};
+
 use crate::{Error, Result};
 use glam::{Affine3A, Vec2, Vec3};
 use serde::{Deserialize, Serialize};
@@ -111,11 +120,12 @@ impl TriMesh {
 
     /// The sum of the triangles' areas, square metres.
     pub fn area(&self) -> f32 {
-        let twice = |i| {
-            let [a, b, c] = self.corners(i).map(|v| v.as_dvec3());
-            (b - a).cross(c - a).length()
-        };
-        ((0..self.triangles.len()).map(twice).sum::<f64>() / 2.0) as f32
+        (0..self.triangles.len()).map(|i| self.triangle_area(i)).sum::<f64>() as f32
+    }
+
+    fn triangle_area(&self, i: usize) -> f64 {
+        let [a, b, c] = self.corners(i).map(|v| v.as_dvec3());
+        (b - a).cross(c - a).length() / 2.0
     }
 
     /// Refuses a mesh without triangles, positions that are not finite, and numbers of vertices, objects or materials that it has not.

@@ -14,6 +14,7 @@ use crate::body::smplx::parse;
 use crate::body::tests::few_vertices;
 use crate::io::numpy::{Array, Npz, parse_npy};
 use crate::io::zip::{Archive, pack};
+use crate::scene::SdfGrid;
 use crate::scene::mesh::{Format, MeshOptions};
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
@@ -152,6 +153,15 @@ proptest! {
                 Ok(imported) => prop_assert!(imported.mesh.check().is_ok()),
                 Err(error) => prop_assert!(error.to_string().contains("scenes"), "{error}"),
             }
+        }
+    }
+
+    #[test]
+    fn damaged_grids(changes in damage(), which in 0..2usize) {
+        let name = ["authors.pkl", "authors.npz"][which];
+        match SdfGrid::parse(Path::new(name), &damaged(fixture(&format!("scenes/{name}")), &changes)) {
+            Ok(grid) => prop_assert!(grid.check().is_ok()),
+            Err(error) => prop_assert!(error.to_string().contains(name), "{error}"),
         }
     }
 

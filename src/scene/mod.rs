@@ -8,6 +8,7 @@ mod paths;
 mod polygon;
 mod rings;
 pub mod rooms;
+pub mod sdf;
 mod sparse;
 mod walkable;
 
@@ -18,6 +19,7 @@ pub use pairs::{Pair, PairOptions, read_pairs, write_pairs};
 pub use paths::{Navigator, Route};
 pub use polygon::Polygon;
 pub use rooms::{Room, RoomKind, Rooms, Split};
+pub use sdf::{SdfGrid, SdfOptions};
 pub use sparse::{Setting, SparseKind, SparseScenes};
 pub use walkable::{Walkable, WalkableOptions, floor_height};
 

@@ -5,7 +5,8 @@
     venv/bin/python motion.py paper             # this project, Tianshou in batches, in turn
     venv/bin/python motion.py paper --authors   # and as the authors arrange it
 
-The same network, minibatches, motion model, body and rewards in all of them, two threads. What takes turns:
+The same network, minibatches, motion model, body and rewards in all of them, two threads (`--threads 1` on a busy machine, where threads
+that wait for each other cost processor time). What takes turns:
 
     here      `train`: collect and update, by its own timing.csv; its processor time is that of a long run less that of a short one
     batched   Tianshou 0.5.1, 256 people at once in PyTorch (motion_people.py)
@@ -163,7 +164,7 @@ def authors(recipe):
     return DummyVectorEnv([One] * recipe["run"]["envs"])
 
 
-def peer(arrangement, recipe, updates):
+def peer(arrangement, recipe, updates, threads):
     """Trains with Tianshou; seconds by the clock and of processor time of each update, and the rate of a matrix product."""
     import numpy as np
     import torch
@@ -171,7 +172,7 @@ def peer(arrangement, recipe, updates):
     from tianshou.policy import PPOPolicy
     from torch.distributions import Distribution, Independent, Normal
 
-    torch.set_num_threads(2)
+    torch.set_num_threads(threads)
     torch.manual_seed(0)
     np.random.seed(0)
     Distribution.set_default_validate_args(False)
@@ -214,13 +215,13 @@ def product_rate():
     return 2 * 2048**3 / best * 1e-9
 
 
-def here(train, name, updates, steps):
+def here(train, name, updates, steps, threads):
     """The same of `train`."""
 
     def run(updates):
         with tempfile.TemporaryDirectory() as folder:
             only = ["run.epoch_steps=%d" % steps, "run.epochs=%d" % updates, "test.every=9999", "test.episodes=1", "checkpoint.every=9999"]
-            command = [train, name, "--threads", "2", "--out", f"{folder}/run", *(x for set_ in only for x in ("--set", set_))]
+            command = [train, name, "--threads", str(threads), "--out", f"{folder}/run", *(x for set_ in only for x in ("--set", set_))]
             before = sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
             done = subprocess.run(command, capture_output=True, text=True)
             if done.returncode:
@@ -256,21 +257,22 @@ def main():
     parser.add_argument("--authors", action="store_true", help="also as the authors arrange it (minutes a round)")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--updates", type=int, default=6, help="updates that count in a round")
+    parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--train", default=str(ROOT / "target/release/train"))
     parser.add_argument("--peer", help=argparse.SUPPRESS)
     args = parser.parse_args()
     recipe = tomllib.loads((ROOT / f"train/recipes/{args.recipe}.toml").read_text())
     if args.peer:
-        return print(json.dumps(peer(args.peer, recipe, args.updates)))
+        return print(json.dumps(peer(args.peer, recipe, args.updates, args.threads)))
     runs = {name: [] for name in ["here", "batched", "bare"] + ["authors"] * args.authors}
-    threads = os.environ | {"OMP_NUM_THREADS": "2", "MKL_NUM_THREADS": "2"}
+    threads = os.environ | dict.fromkeys(["OMP_NUM_THREADS", "MKL_NUM_THREADS"], str(args.threads))
     for i in range(args.rounds):
         for name, results in runs.items():
             if name == "here":
-                results.append(here(args.train, args.recipe, args.updates, recipe["run"]["collect_steps"]))
+                results.append(here(args.train, args.recipe, args.updates, recipe["run"]["collect_steps"], args.threads))
             else:
                 updates = 1 if name == "authors" else args.updates
-                command = [sys.executable, __file__, args.recipe, "--peer", name, "--updates", str(updates)]
+                command = [sys.executable, __file__, args.recipe, "--peer", name, "--updates", str(updates), "--threads", str(args.threads)]
                 results.append(json.loads(subprocess.run(command, env=threads, stdout=subprocess.PIPE, check=True).stdout))
             print(f"round {i} {name}: {results[-1]}", file=sys.stderr)
     report(runs, operations(recipe["policy"], weights(recipe)["pose"] != 0))

@@ -1,8 +1,8 @@
 use super::build::SdfOptions;
 use super::tree::{Tree, Tri};
 use super::*;
-use crate::scene::TriMesh;
 use crate::scene::mesh::{MeshOptions, read_mesh};
+use crate::scene::{RoomKind, Rooms, TriMesh};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 
@@ -173,6 +173,25 @@ fn inside_of_a_room_is_free() {
     // Without a point in free space the room is one solid.
     options.free.clear();
     assert!(SdfGrid::build(&room(), &options).unwrap().at(Vec3::new(-1.0, 0.0, 1.0)) < 0.0);
+}
+
+#[test]
+fn walkable_floor_of_drawn_rooms_is_free() {
+    for seed in 0..3 {
+        let room = Rooms { kind: RoomKind::Furnished, difficulty: 0.5 * seed as f32 }.draw(seed).unwrap();
+        let grid = SdfGrid::build(&room.mesh, &options(0.12, 0.1, Some(0.0))).unwrap();
+        let (mut walked, mut blocked) = (0, 0);
+        // Below the lintels of doors, what stands there is no nearer than the border of its footprint.
+        for (p, v) in each(&grid).filter(|(p, _)| p.z > 0.0 && p.z < 1.5) {
+            if room.walkable.contains(p.truncate().as_dvec2()) {
+                let clearance = room.walkable.border_distance(p.truncate().as_dvec2()) as f32;
+                assert!(v >= clearance - 1e-4, "{}: {p} is {v} from obstacles, {clearance} from their footprints", room.name);
+                walked += 1;
+            }
+            blocked += usize::from(v < 0.0);
+        }
+        assert!(walked > 1000 && blocked > 100, "{}: {walked} {blocked}", room.name);
+    }
 }
 
 #[test]

@@ -94,9 +94,10 @@ impl SdfGrid {
         if obstacles.is_empty() {
             return Err(Error::invalid("the mesh is nothing but floor: there is no obstacle to measure distances to"));
         }
-        let (obstacles, all) = rayon::join(|| Tree::new(obstacles), || Tree::new(all));
+        let floor = obstacles.len() < all.len();
+        let (obstacles, with_floor) = rayon::join(|| Tree::new(obstacles), || floor.then(|| Tree::new(all)));
         let mut grid = Self { lowest, voxel: options.voxel, dims, values: vec![0.0; dims.iter().product()] };
-        let excess = grid.measure(&obstacles, &all, options);
+        let excess = grid.measure(&obstacles, with_floor.as_ref().unwrap_or(&obstacles), options);
         grid.nearer(grid.caps(&excess), options);
         grid.values.par_iter_mut().zip(&excess).for_each(|(value, &excess)| *value = if excess > 0.0 { -*value } else { *value });
         grid.check()?;

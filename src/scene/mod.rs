@@ -1,6 +1,8 @@
 //! Scenes as data: where people may walk, what stands there, and procedural makers.
 
+mod bundle;
 mod grid;
+mod make;
 pub mod mesh;
 mod outline;
 mod pairs;
@@ -12,8 +14,10 @@ pub mod sdf;
 mod sparse;
 mod walkable;
 
+pub use bundle::{PICTURE, SceneBundle};
 pub use grid::Grid;
-pub use mesh::{Material, TriMesh};
+pub use make::{MakeOptions, SceneFiles, Stages};
+pub use mesh::{Material, MeshOptions, TriMesh, Up, read_mesh};
 pub use outline::{navmesh_polygon, read_polygon};
 pub use pairs::{Pair, PairOptions, read_pairs, write_pairs};
 pub use paths::{Navigator, Route};

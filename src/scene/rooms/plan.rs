@@ -3,7 +3,7 @@
 use super::furniture::{Kind, Piece};
 use super::shell::Shell;
 use crate::rng::Stream;
-use crate::scene::{BoxObstacle, Grid};
+use crate::scene::{BoxObstacle, Grid, Polygon};
 use glam::{DVec2, Vec2, Vec3};
 use rand::RngExt;
 use std::f32::consts::{FRAC_PI_2, TAU};
@@ -22,8 +22,10 @@ pub struct Plan<'a> {
     pub shell: Shell,
     pub pieces: Vec<Piece>,
     pub rng: &'a mut Stream,
-    /// Of each cell the distance from walls and pieces, negative outside.
+    floor: Polygon,
+    /// Cells of the floor.
     free: Grid,
+    /// Of each cell the distance from walls and pieces, negative outside.
     gaps: Vec<f64>,
     /// Cells that a person could stand on in the empty room.
     empty: usize,
@@ -48,7 +50,8 @@ impl<'a> Plan<'a> {
             BoxObstacle { centre, size: Vec2::new(1.0, 0.9), yaw: along.as_vec2().to_angle(), height: 0.0 }
         });
         let kept = kept.collect();
-        Ok(Self { shell, pieces: Vec::new(), rng, free, gaps, empty, kept })
+        let floor = Polygon::new(shell.ring.clone(), Vec::new())?;
+        Ok(Self { floor, shell, pieces: Vec::new(), rng, free, gaps, empty, kept })
     }
 
     /// Draws from `low..high`.
@@ -117,7 +120,7 @@ impl<'a> Plan<'a> {
 
     fn fits(&self, piece: &Piece, belongs_to: Option<usize>) -> bool {
         let bounds = piece.bounds();
-        let inside = |p: &DVec2| self.free.holds(*p) && self.shell.distance(*p) > 0.01;
+        let inside = |p: &DVec2| self.floor.contains(*p) && self.shell.distance(*p) > 0.01;
         let corners = bounds.corners();
         let reflex = self.shell.ring.iter().any(|p| bounds.distance(p.as_vec2()) < 0.01);
         let others = self.pieces.iter().enumerate().filter(|(i, _)| Some(*i) != belongs_to);

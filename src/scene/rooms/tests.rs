@@ -32,6 +32,8 @@ fn hundreds_of_different_rooms_that_hang_together() {
     for room in rooms(60) {
         room.mesh.check().unwrap();
         assert!(crossing(&[room.walkable.exterior()]).is_none() && volume(&room.mesh) > 0.0, "{}", room.name);
+        let floor = Polygon::new(room.walkable.exterior().to_vec(), vec![]).unwrap();
+        assert!(room.walkable.holes().iter().flatten().all(|&p| floor.contains(p)), "{}: a piece stands in a wall", room.name);
         let free = standing(&room.walkable, 0.3);
         let main = free.largest_part().unwrap().area();
         assert!(main >= 0.9 * free.area() && main > 2.0, "{}: {main} of {} m2", room.name, free.area());

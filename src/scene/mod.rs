@@ -1,6 +1,7 @@
 //! Scenes as data: where people may walk, what stands there, and procedural makers.
 
 mod bundle;
+mod crowded;
 mod grid;
 mod make;
 pub mod mesh;
@@ -15,6 +16,7 @@ mod sparse;
 mod walkable;
 
 pub use bundle::{PICTURE, SceneBundle};
+pub use crowded::{CrowdedScene, CrowdedScenes};
 pub use grid::Grid;
 pub use make::{MakeOptions, SceneFiles, Stages};
 pub use mesh::{Material, MeshOptions, TriMesh, Up, read_mesh};

@@ -1,6 +1,7 @@
 //! What a motion task is, as data.
 
-use egogen::scene::SparseScenes;
+use super::crowd::Penetration;
+use egogen::scene::{CrowdedScenes, SparseScenes};
 use egogen::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
@@ -45,6 +46,10 @@ pub struct PoseCheck {
 pub struct MotionTask {
     /// How scenes, starts and goals are drawn.
     pub scene: SparseScenes,
+    /// Rooms to walk in instead of `scene`, with the penetration of eq. 8 and 11 instead of eq. 7's.
+    pub rooms: Option<CrowdedScenes>,
+    /// How penetration is judged in rooms.
+    pub penetration: Penetration,
     pub weights: Weights,
     pub pose: PoseCheck,
     /// Act through that many latents, those that move people most, and leave the others 0; absent: all of them, as published.
@@ -65,6 +70,8 @@ impl Default for MotionTask {
     fn default() -> Self {
         Self {
             scene: SparseScenes::default(),
+            rooms: None,
+            penetration: Penetration::default(),
             weights: Weights::default(),
             pose: PoseCheck::default(),
             latents: None,
@@ -81,6 +88,7 @@ impl MotionTask {
     /// Refuses values that make no task; the message names the key and what would be right.
     pub fn validate(&self) -> Result<()> {
         self.scene.validate()?;
+        self.rooms.as_ref().map_or(Ok(()), |r| r.validate("rooms"))?;
         let need = |ok: bool, key: &str, right: &str| {
             if ok { Ok(()) } else { Err(Error::invalid(format!("{key}: expected {right}"))) }
         };
@@ -89,6 +97,7 @@ impl MotionTask {
             need(weight.is_finite(), &format!("weights.{}", term.name), "a finite number")?;
         }
         need(self.pose.threshold.is_none_or(|t| t > 0.0 && t.is_finite()), "pose.threshold", "more than 0")?;
+        need(self.penetration.most.is_none_or(|n| n > 0.0 && n.is_finite()), "penetration.most", "more than 0 vertices")?;
         need(self.latents != Some(0), "latents", "1 or more")?;
         need((1..=1000).contains(&self.max_depth), "max_depth", "1 to 1000 steps")?;
         need((0.0..=180.0).contains(&self.yaw_noise_deg), "yaw_noise_deg", "0 to 180 degrees")?;
@@ -116,6 +125,9 @@ mod tests {
         for (text, key) in [
             (r#"{"max_depth": 0}"#, "max_depth"),
             (r#"{"latents": 0}"#, "latents"),
+            (r#"{"rooms": {"count": 0}}"#, "rooms.count"),
+            (r#"{"rooms": {"pairs": {"blocked": 2.0}}}"#, "rooms.pairs.blocked"),
+            (r#"{"penetration": {"most": 0.0}}"#, "penetration.most"),
             (r#"{"yaw_noise_deg": -1.0}"#, "yaw_noise_deg"),
             (r#"{"success_distance": 0.0}"#, "success_distance"),
             (r#"{"blocked_cells": 0}"#, "blocked_cells"),

@@ -1,12 +1,13 @@
 //! The vectorised environment of the motion task.
 
+use super::crowd::Crowd;
 use super::member::{Member, OBS, STATE, Step, blocked};
 use super::{EPISODE, MotionTask, OwnTerm, TERMS};
 use crate::{ActionSpace, EnvError, EnvSpec, ObsGroup, StepResult, VecEnv};
 use egogen::body::PARAMS;
 use egogen::motion::{FRAMES, PosePrior, SEED};
 use egogen::rng::stream;
-use egogen::scene::Setting;
+use egogen::scene::{CrowdedScene, Setting, Split};
 use egogen::sensing::RAYS;
 use egogen::sim::{People, Primitives, SeedBank, Sim, yaw_towards};
 use rand::RngExt;
@@ -15,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 /// First word of a saved state; counts up when its layout changes.
-const KIND: &str = "motion-env 1";
+const KIND: &str = "motion-env 2";
 
 /// Which episodes are played. The draws of episode k of environment i depend on the seed and on:
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -42,6 +43,8 @@ pub struct MotionEnv {
     bank: Arc<SeedBank>,
     /// Judges poses; none when eq. 9 has no weight.
     judge: Option<PoseJudge>,
+    /// The rooms, for a task in rooms.
+    crowd: Option<Crowd>,
     state: State,
     prims: Primitives,
 }
@@ -107,7 +110,8 @@ impl MotionEnv {
         let spec = spec(task.latents.unwrap_or(dim));
         let state = State { seed, people: People::new(n), members: vec![Member::default(); n] };
         let judge = PoseJudge::new(&task)?;
-        let mut env = Self { spec, task, own: Vec::new(), starts, sim, bank, judge, state, prims: Primitives::default() };
+        let crowd = Crowd::new(&task, &sim, if starts == Starts::Fixed { Split::Validation } else { Split::Train })?;
+        let mut env = Self { spec, task, own: Vec::new(), starts, sim, bank, judge, crowd, state, prims: Primitives::default() };
         env.restart(seed)?;
         Ok(env)
     }
@@ -144,6 +148,11 @@ impl MotionEnv {
         &self.state.members[i].setting
     }
 
+    /// The room of environment `i`'s present episode, for a task in rooms.
+    pub fn room(&self, i: usize) -> Option<&CrowdedScene> {
+        self.crowd.as_ref().zip(self.state.members[i].room).and_then(|(crowd, room)| crowd.scene(room).ok())
+    }
+
     /// Number of the start that environment `i` plays now; meaningful for [`Starts::Fixed`].
     pub fn start_number(&self, i: usize) -> u64 {
         self.draw_index(i, self.state.members[i].episode)
@@ -172,18 +181,26 @@ impl MotionEnv {
         let mut rng = stream(self.state.seed, purpose, self.draw_index(i, episode));
         let noise = self.task.yaw_noise_deg.to_radians();
         for _ in 0..1000 {
-            let setting = self.task.scene.draw(&mut rng)?;
+            let (room, setting) = match &self.crowd {
+                Some(crowd) => crowd.draw(&mut rng),
+                None => (None, self.task.scene.draw(&mut rng)?),
+            };
             let to = setting.goal - setting.start;
             let turn = rng.random_range(-noise..=noise);
             let seed = &self.bank.seeds[rng.random_range(0..self.bank.seeds.len())];
             let yaw = yaw_towards(to.x, to.y) + turn;
             self.state.people.place(i, self.sim.body(), seed, yaw, setting.start.x, setting.start.y)?;
-            if blocked(&self.task, &self.state.people, i, &setting.scene.walkable) == 0 {
-                self.state.members[i] = Member::begin(episode, setting, &self.state.people, i);
+            let people = &self.state.people;
+            let free = match (&self.crowd, room) {
+                (Some(crowd), Some(room)) => crowd.stands_free(room, people, i),
+                _ => blocked(&self.task, people, i, &setting.scene.walkable) == 0,
+            };
+            if free {
+                self.state.members[i] = Member::begin(episode, (room, setting), people, i);
                 return Ok(());
             }
         }
-        Err(EnvError::Invalid("no free start in 1000 draws: give scene.clearance more room".into()))
+        Err(EnvError::Invalid("no free start in 1000 draws: give scene.clearance (in rooms: pairs.clearance) more room".into()))
     }
 
     fn write_obs(&self, obs: &mut [f32]) {
@@ -196,12 +213,13 @@ impl MotionEnv {
     fn judge(&mut self, out: &mut StepResult) -> Result<Vec<usize>, EnvError> {
         let State { people, members, .. } = &mut self.state;
         let (task, prims, people, judge) = ((&self.task, self.own.as_slice()), &self.prims, &*people, &self.judge);
-        let names = &self.spec.info;
+        let (names, crowd) = (&self.spec.info, &self.crowd);
         let (terms, figures) = (out.info.par_chunks_exact_mut(names.len()), out.episode.par_chunks_exact_mut(EPISODE.len()));
         let each = (members, terms, figures, &mut out.reward, &mut out.terminated).into_par_iter().with_min_len(CHUNK);
         each.enumerate().for_each(|(i, (member, terms, episode, reward, ended))| {
             let natural = judge.as_ref().is_none_or(|j| j.natural(prims, i));
-            let verdict = member.judge(task, &Step { people, prims, person: i, natural }, terms, episode);
+            let presence = crowd.as_ref().zip(member.room).map(|(crowd, room)| crowd.presence(room, people, prims, i));
+            let verdict = member.judge(task, &Step { people, prims, person: i, natural, presence }, terms, episode);
             (*reward, *ended) = (verdict.reward, verdict.ended);
         });
         if let Some(i) = out.reward.iter().position(|r| !r.is_finite()) {

@@ -1,7 +1,7 @@
 //! One person on its task: what it sees, what a step earned it, how its episode went.
 
 use super::rewards::{Outcome, OwnTerm, TERMS};
-use super::{EPISODE, MotionTask};
+use super::{EPISODE, MotionTask, Presence};
 use egogen::body::{JOINTS, MARKER_DIM, canonical_frame, joint};
 use egogen::motion::{FRAMES, Origin, SEED};
 use egogen::scene::{Polygon, Setting};
@@ -23,6 +23,8 @@ pub(super) struct Member {
     /// Episodes this environment played before.
     pub episode: u64,
     pub setting: Setting,
+    /// Number of the room it plays in.
+    pub room: Option<u32>,
     /// The goal at the height of the pelvis at the start, world.
     pub goal: Vec3,
     pub steps: u32,
@@ -32,6 +34,7 @@ pub(super) struct Member {
     min_dist: f32,
     path: f32,
     near_steps: u32,
+    inside: f32,
 }
 
 /// A step that a person made.
@@ -41,6 +44,8 @@ pub(super) struct Step<'a> {
     pub person: usize,
     /// Its poses were natural.
     pub natural: bool,
+    /// How much of it lay inside what stands in its room.
+    pub presence: Option<Presence>,
 }
 
 /// What a step brought.
@@ -51,13 +56,13 @@ pub(super) struct Verdict {
 
 impl Member {
     /// Begins an episode of person `i`, already placed.
-    pub fn begin(episode: u64, setting: Setting, people: &People, i: usize) -> Self {
+    pub fn begin(episode: u64, (room, setting): (Option<u32>, Setting), people: &People, i: usize) -> Self {
         let frame = &people.frames[i];
         let pelvis = frame.point(seed_joint(people, i, 0, joint::PELVIS));
         let goal = setting.goal.extend(pelvis.z);
         let dist = pelvis.distance(goal);
         let min_dist = pelvis.truncate().distance(setting.goal);
-        Self { episode, setting, goal, dist, min_dist, ..Self::default() }
+        Self { episode, setting, room, goal, dist, min_dist, ..Self::default() }
     }
 
     /// Writes the observation row of person `i`; markers count from `origin`.
@@ -85,7 +90,7 @@ impl Member {
     pub fn judge(
         &mut self,
         (task, own): (&MotionTask, &[OwnTerm]),
-        &Step { people, prims, person: i, natural }: &Step,
+        &Step { people, prims, person: i, natural, presence }: &Step,
         terms: &mut [f32],
         episode: &mut [f32],
     ) -> Verdict {
@@ -105,7 +110,11 @@ impl Member {
             dist,
             natural,
             arrived: dist < task.success_distance,
-            penetrates: blocked(task, people, i, &self.setting.scene.walkable) >= task.blocked_cells,
+            penetrates: match presence {
+                Some(p) => task.penetration.most.is_some_and(|most| p.most >= most),
+                None => blocked(task, people, i, &self.setting.scene.walkable) >= task.blocked_cells,
+            },
+            crowded: presence.map(|p| p.reward(task.penetration.form)),
             left: task.max_depth - self.steps,
         };
         for (out, term) in terms.iter_mut().zip(&TERMS) {
@@ -117,6 +126,7 @@ impl Member {
         let reward = terms.iter().sum();
         self.dist = dist;
         self.total += reward;
+        self.inside += presence.map_or(0.0, |p| p.count);
         self.near_steps += u32::from(dist < NEAR && !outcome.arrived);
         self.follow(prims, i);
         let ended = outcome.arrived || outcome.penetrates || outcome.left == 0;
@@ -152,6 +162,7 @@ impl Member {
             self.min_dist,
             f32::from(self.near_steps > 2),
             self.path,
+            self.inside / self.steps as f32,
         ]
     }
 }

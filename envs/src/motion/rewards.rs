@@ -25,8 +25,10 @@ pub struct Outcome<'a> {
     pub natural: bool,
     /// Nearer than the task's success distance.
     pub arrived: bool,
-    /// The body's box holds as many non-walkable cells as the task forbids.
+    /// The body's box holds as many non-walkable cells, or in rooms one frame as many vertices inside, as the task forbids.
     pub penetrates: bool,
+    /// In rooms the value of eq. 8.
+    pub crowded: Option<f32>,
     /// Steps left in the episode.
     pub left: u32,
 }
@@ -96,9 +98,9 @@ fn pose(o: &Outcome) -> f32 {
     if o.natural { 0.05 } else { 0.0 }
 }
 
-/// Eq. 7: 0.05 while the body's box holds too few non-walkable cells to count.
+/// Eq. 8 in rooms; else eq. 7: 0.05 while the body's box holds too few non-walkable cells to count.
 fn penetration(o: &Outcome) -> f32 {
-    if o.penetrates { 0.0 } else { 0.05 }
+    o.crowded.unwrap_or(if o.penetrates { 0.0 } else { 0.05 })
 }
 
 /// Eq. 10: 1 on arrival.
@@ -151,6 +153,7 @@ mod tests {
             natural: true,
             arrived: false,
             penetrates: false,
+            crowded: None,
             left: 3,
         }
     }
@@ -193,6 +196,7 @@ mod tests {
         let there = Outcome { arrived: true, ..o };
         assert_eq!([penetration(&there), success(&there), arrival(&there)], [0.05, 1.0, 3.0]);
         let crash = Outcome { penetrates: true, ..there };
+        assert_eq!(penetration(&Outcome { crowded: Some(0.7), ..crash }), 0.7);
         assert_eq!([penetration(&crash), success(&crash), arrival(&crash)], [0.0, 1.0, 0.0]);
     }
 

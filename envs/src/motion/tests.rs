@@ -1,12 +1,12 @@
 //! Whole episodes of a gliding figure whose rewards are known in advance.
 
 use super::toy::Toy;
-use super::{EPISODE, MotionEnv, MotionTask, TERMS};
+use super::{EPISODE, Form, MotionEnv, MotionTask, Penetration, TERMS};
 use crate::conformance::{Effort, check};
 use crate::{EnvError, StepResult, VecEnv};
 use egogen::body::{BETAS, BodyModel, Frame, MARKER_DIM, joint};
 use egogen::motion::Origin;
-use egogen::scene::{SparseKind, SparseScenes};
+use egogen::scene::{CrowdedScenes, PairOptions, RoomKind, SparseKind, SparseScenes};
 use egogen::sim::{SeedBank, SeedMotion, Sim};
 use glam::{Vec2, Vec3};
 use std::sync::Arc;
@@ -234,4 +234,55 @@ fn foreign_states_and_empty_banks_are_refused() {
     let (sim, _) = world();
     let empty = MotionEnv::new(MotionTask::default(), sim, Arc::default(), 2, 0);
     assert!(matches!(empty, Err(EnvError::Invalid(what)) if what.contains("seed bank")));
+}
+
+/// Two small rooms.
+fn rooms() -> MotionTask {
+    let pairs = PairOptions { count: 8, ..Default::default() };
+    let rooms = CrowdedScenes { kind: RoomKind::Hall, difficulty: [0.5, 0.5], count: 2, pairs, voxel: 0.1, ..Default::default() };
+    MotionTask { rooms: Some(rooms), max_depth: 13, ..Default::default() }
+}
+
+#[test]
+fn rooms_conform() {
+    let effort = Effort { steps: 20, action_scale: 1.0 };
+    check(|n, seed| Box::new(env(rooms(), n, seed)), effort);
+    let strict = MotionTask { penetration: Penetration { most: Some(40.0), points: 300, form: Form::Count }, ..rooms() };
+    check(|n, seed| Box::new(env(strict.clone(), n, seed)), effort);
+}
+
+#[test]
+fn training_and_tests_play_in_different_rooms() {
+    let (sim, bank) = world();
+    let train = MotionEnv::new(rooms(), sim.clone(), bank.clone(), 8, 1).unwrap();
+    let test = MotionEnv::evaluation(rooms(), sim, bank, 8, 1).unwrap();
+    let names = |e: &MotionEnv| (0..8).map(|i| e.room(i).unwrap().name.clone()).collect::<std::collections::BTreeSet<_>>();
+    assert!(names(&train).len() == 2 && names(&train).is_disjoint(&names(&test)), "{:?} {:?}", names(&train), names(&test));
+}
+
+#[test]
+fn who_walks_into_columns_pays_and_in_the_second_stage_ends() {
+    // The figure glides straight on at 1 m/s, through whatever stands there.
+    let play = |most: Option<f32>| {
+        let task = MotionTask { penetration: Penetration { most, ..Default::default() }, yaw_noise_deg: 0.0, ..rooms() };
+        let mut env = env(task, 24, 2);
+        let (mut out, mut inside, mut ended, mut least) = (StepResult::default(), 0, 0, 1.0f32);
+        for _ in 0..13 {
+            env.step(&[1.0, 0.0, 0.0, 0.0].repeat(24), &mut out).unwrap();
+            let width = TERMS.len();
+            let at = TERMS.iter().position(|t| t.name == "penetration").unwrap();
+            for i in 0..24 {
+                let value = out.info[i * width + at] / 0.1;
+                least = least.min(value);
+                inside += usize::from(value < 0.9);
+                let hit = out.episode[i * EPISODE.len() + 1];
+                ended += usize::from(out.terminated[i] && hit == 1.0);
+            }
+        }
+        (inside, ended, least)
+    };
+    let (inside, ended, least) = play(None);
+    assert!(inside > 5 && ended == 0 && (0.0..0.5).contains(&least), "{inside} {ended} {least}");
+    let (_, ended, _) = play(Some(40.0));
+    assert!(ended > 2, "{ended}");
 }

@@ -347,20 +347,20 @@ mod tests {
             let mut before = vec![(0, 0); rows];
             for step in 0..2 * depth as u64 {
                 let shard = lanes.batch(7, step).remove(0);
-                for i in 0..rows {
+                for (i, &(_, last)) in before.iter().enumerate() {
                     let (clip, start) = lanes.at[i];
                     let mut window = vec![0.0; FRAMES * MARKER_DIM];
                     set.canonical_window(clip, start, FRAMES, &mut window);
                     assert_eq!(row(&shard.target, rows, i, 0..FUTURE + 1), window[MARKER_DIM..]);
                     let apart = row(&shard.seed, rows, i, 0..SEED).iter().zip(&window).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-                    let over = before[i].1 + FUTURE + FRAMES > set.clips[0].len();
+                    let over = last + FUTURE + FRAMES > set.clips[0].len();
                     assert_eq!(lanes.fresh[i], lanes.is_start(step) || over, "row {i} of step {step}");
                     if lanes.fresh[i] {
                         assert_eq!(apart, 0.0);
                         anew += usize::from(!lanes.is_start(step));
                     } else {
                         // Who predicts what was recorded has its next seed there too, but for the regressor's error.
-                        assert_eq!(start, before[i].1 + FUTURE);
+                        assert_eq!(start, last + FUTURE);
                         assert!(apart < 0.03, "row {i} of step {step} begins {apart} m away");
                         went_on += 1;
                     }

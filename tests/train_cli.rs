@@ -160,8 +160,6 @@ fn the_motion_task_trains_and_resumes() {
     untrained_motion(&motion);
     let motion = format!("env_options.motion={}", motion.display());
     let small = [
-        // A linear one depends on the number of epochs, which differs here.
-        "adam.schedule=constant",
         "run.envs=8",
         "run.collect_steps=32",
         "run.epoch_steps=64",
@@ -171,6 +169,7 @@ fn the_motion_task_trains_and_resumes() {
         "test.episodes=4",
         "test.every=1",
         "checkpoint.every=1",
+        "env_options.task.latents=4",
     ];
     let sizes = ["policy.gru={ state = 16, egosensing = 8 }", "policy.trunk=16"];
     let sets: Vec<&str> = small.iter().chain(&sizes).chain([&motion.as_str()]).flat_map(|s| ["--set", s]).collect();

@@ -5,6 +5,7 @@
 //! result is the same bits on every instruction set, in every batch and on any number of threads.
 //! Training uses general products instead (`product`). This is the only module with `unsafe`: in `simd` and `product`.
 
+mod engine;
 mod gru;
 mod linear;
 mod motion;
@@ -13,8 +14,9 @@ mod pool;
 mod product;
 mod simd;
 
+pub use engine::MotionEngine;
 pub use gru::GruCell;
 pub use linear::{Activation, Linear, Source, View, ViewMut};
-pub use motion::{Decoder, MotionEngine, Regressor};
+pub use motion::{Decoder, Regressor};
 pub use policy::PolicyEngine;
 pub use product::{Mat, product};

@@ -20,8 +20,6 @@ pub struct Sim {
     model: Arc<dyn MotionModel>,
     /// The mean body's soles, for models that want feet planted.
     soles: Option<Skeleton>,
-    /// See [`MotionModel::active`].
-    active: Vec<usize>,
     /// Buffers between steps; a step takes one and puts it back, so steps may run side by side.
     spare: Mutex<Vec<Buffers>>,
 }
@@ -41,8 +39,7 @@ impl Sim {
     /// People with `body`, moved by `model`.
     pub fn new(body: Arc<BodyModel>, model: Arc<dyn MotionModel>) -> Self {
         let soles = model.planted().then(|| Skeleton::new(&body));
-        let active = model.active();
-        Self { body, model, soles, active, spare: Mutex::default() }
+        Self { body, model, soles, spare: Mutex::default() }
     }
 
     /// The body everybody has, up to shape.
@@ -60,13 +57,14 @@ impl Sim {
     /// # Errors
     /// If the model has not that many.
     pub fn widen(&self, latents: &[f32], k: usize) -> Result<Vec<f32>> {
-        let dim = self.active.len();
+        let active = self.model.active();
+        let dim = active.len();
         if k == 0 || k > dim {
             return Err(Error::invalid(format!("actions of {k} latents, the motion model has {dim}")));
         }
         let mut wide = vec![0.0; latents.len() / k * dim];
         for (from, to) in latents.chunks_exact(k).zip(wide.chunks_exact_mut(dim)) {
-            from.iter().zip(&self.active).for_each(|(v, &at)| to[at] = *v);
+            from.iter().zip(&active).for_each(|(v, &at)| to[at] = *v);
         }
         Ok(wide)
     }

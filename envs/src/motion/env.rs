@@ -281,6 +281,12 @@ impl VecEnv for MotionEnv {
         if [state.members.len(), state.people.len()] != [self.num_envs(); 2] {
             return Err(bad(format!("it holds {}", state.members.len())));
         }
+        if let Some(i) = state.members.iter().position(|m| m.room.is_some() != self.crowd.is_some()) {
+            return Err(bad(format!("environment {i} of it does not say in which room it plays")));
+        }
+        if let Some((i, room)) = state.members.iter().enumerate().find_map(|(i, m)| Some((i, self.crowd.as_ref()?.scene(m.room?).err()?))) {
+            return Err(bad(format!("environment {i} of it plays in {room}")));
+        }
         self.state = state;
         Ok(())
     }

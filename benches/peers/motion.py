@@ -14,8 +14,8 @@ that wait for each other cost processor time). What takes turns:
     authors   Tianshou, one environment after the other, each computed four times over, a mesh of 10,475 vertices skinned with pose
               correctives in every frame, rays through shapely
 
-An update is `run.collect_steps` steps of `run.envs` environments and one pass over them (authors: 256 steps, for patience). The first
-one is not counted. Ratios are taken within a round, so that whatever else the machine does meets all of them.
+An update is `run.collect_steps` steps of `run.envs` environments and the recipe's passes over them (authors: 256 steps, for patience).
+The first one is not counted. All act through all 128 latents (the recipe `quick` through 12 of them). Ratios are taken within a round, so that whatever else the machine does meets all of them.
 """
 import argparse
 import csv
@@ -220,7 +220,8 @@ def here(train, name, updates, steps, threads):
 
     def run(updates):
         with tempfile.TemporaryDirectory() as folder:
-            only = ["run.epoch_steps=%d" % steps, "run.epochs=%d" % updates, "test.every=9999", "test.episodes=1", "checkpoint.every=9999"]
+            only = ["run.epoch_steps=%d" % steps, "run.epochs=%d" % updates, "test.every=9999", "test.episodes=1", "checkpoint.every=9999",
+                "env_options.task.latents=128"]
             command = [train, name, "--threads", str(threads), "--out", f"{folder}/run", *(x for set_ in only for x in ("--set", set_))]
             before = sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
             done = subprocess.run(command, capture_output=True, text=True)
@@ -235,7 +236,7 @@ def here(train, name, updates, steps, threads):
     return {"wall": steps * updates / wall, "cpu": steps * updates / (long - short), "collect": total("collect_seconds") / wall}
 
 
-def operations(policy, asks_prior):
+def operations(policy, passes, asks_prior):
     """Multiplications and additions of one environment step, as this project computes it: no value twice, no product with a zero state."""
     gru, n = policy["gru"], 4 * policy["octaves"]
     encoded = gru["state"] + gru["egosensing"] + n
@@ -248,7 +249,7 @@ def operations(policy, asks_prior):
     decoder = hidden + 18 * (3 * 256 * (201 + 256) + 2 * 256 * 512 + 256 * 201)
     regressor = 18 * (211 * 128 + 3 * (20 * 128**2 + 128 * 159) + 2 * 159 * 128)
     prior = 20 * (63 * 512 + 512**2 + 512 * 32) if asks_prior else 0
-    return 2 * (forward + learning + decoder + regressor + prior)
+    return 2 * (forward + passes * learning + decoder + regressor + prior)
 
 
 def main():
@@ -275,7 +276,7 @@ def main():
                 command = [sys.executable, __file__, args.recipe, "--peer", name, "--updates", str(updates), "--threads", str(args.threads)]
                 results.append(json.loads(subprocess.run(command, env=threads, stdout=subprocess.PIPE, check=True).stdout))
             print(f"round {i} {name}: {results[-1]}", file=sys.stderr)
-    report(runs, operations(recipe["policy"], weights(recipe)["pose"] != 0))
+    report(runs, operations(recipe["policy"], recipe["ppo"]["passes"], weights(recipe)["pose"] != 0))
 
 
 def report(runs, flop):

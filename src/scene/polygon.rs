@@ -34,6 +34,11 @@ impl Polygon {
         Ok(Self { exterior, holes })
     }
 
+    /// The region less `rings`, each of which must be one that [`Polygon::new`] takes.
+    pub fn less(&self, rings: impl IntoIterator<Item = Vec<DVec2>>) -> Self {
+        Self { exterior: self.exterior.clone(), holes: self.holes.iter().cloned().chain(rings).collect() }
+    }
+
     /// The outer ring.
     pub fn exterior(&self) -> &[DVec2] {
         &self.exterior

@@ -79,6 +79,25 @@ impl People {
         }
     }
 
+    /// Sets the people with the numbers `rows` to those of `from`, in this order.
+    ///
+    /// # Panics
+    /// When a number is not below [`People::len`] or `from` has not as many people as there are numbers.
+    pub fn put(&mut self, rows: &[usize], from: &Self) {
+        assert_eq!(rows.len(), from.len(), "one number for each person");
+        let n = self.len().max(1);
+        let set = |to: &mut [f32], from: &[f32]| {
+            let width = to.len() / n;
+            rows.iter().enumerate().for_each(|(k, i)| to[i * width..][..width].copy_from_slice(&from[k * width..][..width]));
+        };
+        rows.iter().zip(&from.frames).for_each(|(&i, frame)| self.frames[i] = *frame);
+        set(&mut self.betas, &from.betas);
+        set(&mut self.markers, &from.markers);
+        set(&mut self.params, &from.params);
+        set(&mut self.joints, &from.joints);
+        set(&mut self.views, &from.views);
+    }
+
     /// Height of person `i`'s pelvis in the seed's first frame above the floor, metres.
     ///
     /// # Panics

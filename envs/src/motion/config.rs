@@ -60,10 +60,12 @@ pub struct MotionTask {
     pub yaw_noise_deg: f32,
     /// The goal is reached when the pelvis is nearer than this at the end of a step, metres (eq. 10).
     pub success_distance: f32,
-    /// That many non-walkable cells under the body's box are a penetration, which ends the episode (eq. 7).
+    /// That many non-walkable cells under the body's box are a penetration (eq. 7).
     pub blocked_cells: usize,
     /// Side of those cells, metres.
     pub cell: f32,
+    /// Whether a penetration ends the episode. If not, who has one may still arrive.
+    pub end_on_penetration: bool,
 }
 
 impl Default for MotionTask {
@@ -80,6 +82,7 @@ impl Default for MotionTask {
             success_distance: 0.1,
             blocked_cells: 3,
             cell: 0.1,
+            end_on_penetration: true,
         }
     }
 }

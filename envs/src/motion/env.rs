@@ -1,5 +1,6 @@
 //! The vectorised environment of the motion task.
 
+use super::cast::{Cast, Stage};
 use super::crowd::Crowd;
 use super::member::{Member, OBS, STATE, Step, blocked};
 use super::{EPISODE, MotionTask, OwnTerm, TERMS};
@@ -7,16 +8,17 @@ use crate::{ActionSpace, EnvError, EnvSpec, ObsGroup, StepResult, VecEnv};
 use egogen::body::PARAMS;
 use egogen::motion::{FRAMES, PosePrior, SEED};
 use egogen::rng::stream;
-use egogen::scene::{CrowdedScene, Setting, Split};
+use egogen::scene::{CrowdedScene, Polygon, Setting, Split};
 use egogen::sensing::RAYS;
 use egogen::sim::{People, Primitives, SeedBank, Sim, yaw_towards};
 use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 use std::sync::Arc;
 
 /// First word of a saved state; counts up when its layout changes.
-const KIND: &str = "motion-env 2";
+const KIND: &str = "motion-env 3";
 
 /// Which episodes are played. The draws of episode k of environment i depend on the seed and on:
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -45,6 +47,8 @@ pub struct MotionEnv {
     judge: Option<PoseJudge>,
     /// The rooms, for a task in rooms.
     crowd: Option<Crowd>,
+    /// The episodes, where they are given instead of drawn.
+    stage: Option<Stage>,
     state: State,
     prims: Primitives,
 }
@@ -90,17 +94,32 @@ struct State {
 impl MotionEnv {
     /// n environments that train on fresh scenes drawn from `seed`.
     pub fn new(task: MotionTask, sim: Arc<Sim>, bank: Arc<SeedBank>, n: usize, seed: u64) -> Result<Self, EnvError> {
-        Self::with_starts(task, sim, bank, n, seed, Starts::Fresh)
+        Self::build(task, sim, (bank, None), n, seed, Starts::Fresh)
     }
 
     /// n environments that play a numbered list of starts fixed by `seed`: first 0 to n-1, then environment i goes on to n+i.
     pub fn evaluation(task: MotionTask, sim: Arc<Sim>, bank: Arc<SeedBank>, n: usize, seed: u64) -> Result<Self, EnvError> {
-        Self::with_starts(task, sim, bank, n, seed, Starts::Fixed)
+        Self::build(task, sim, (bank, None), n, seed, Starts::Fixed)
     }
 
-    fn with_starts(task: MotionTask, sim: Arc<Sim>, bank: Arc<SeedBank>, n: usize, seed: u64, starts: Starts) -> Result<Self, EnvError> {
+    /// Plays the episodes of `cast`, one person each, instead of drawing any; `task.scene` and `task.rooms` have no influence.
+    ///
+    /// Each is played once: whoever ends stands where it is, seen by the others, until the next reset. The state cannot be saved.
+    pub fn staged(task: MotionTask, sim: Arc<Sim>, cast: Cast) -> Result<Self, EnvError> {
+        let (task, n) = (MotionTask { rooms: None, ..task }, cast.roles.len());
+        Self::build(task, sim, (Arc::default(), Some(Stage::new(cast)?)), n, 0, Starts::Fixed)
+    }
+
+    fn build(
+        task: MotionTask,
+        sim: Arc<Sim>,
+        (bank, stage): (Arc<SeedBank>, Option<Stage>),
+        n: usize,
+        seed: u64,
+        starts: Starts,
+    ) -> Result<Self, EnvError> {
         task.validate()?;
-        if bank.seeds.is_empty() {
+        if stage.is_none() && bank.seeds.is_empty() {
             return Err(EnvError::Invalid("the seed bank is empty, expected at least one seed motion".into()));
         }
         let dim = sim.model().latent_dim();
@@ -111,7 +130,7 @@ impl MotionEnv {
         let state = State { seed, people: People::new(n), members: vec![Member::default(); n] };
         let judge = PoseJudge::new(&task)?;
         let crowd = Crowd::new(&task, &sim, if starts == Starts::Fixed { Split::Validation } else { Split::Train })?;
-        let mut env = Self { spec, task, own: Vec::new(), starts, sim, bank, judge, crowd, state, prims: Primitives::default() };
+        let mut env = Self { spec, task, own: Vec::new(), starts, sim, bank, judge, crowd, stage, state, prims: Primitives::default() };
         env.restart(seed)?;
         Ok(env)
     }
@@ -153,6 +172,16 @@ impl MotionEnv {
         self.crowd.as_ref().zip(self.state.members[i].room).and_then(|(crowd, room)| crowd.scene(room).ok())
     }
 
+    /// The given episodes, where they are not drawn.
+    pub fn cast(&self) -> Option<&Cast> {
+        self.stage.as_ref().map(|stage| &stage.cast)
+    }
+
+    /// Where person `i` may walk now: its scene's floor, less what moves there and where others stand.
+    pub fn ground(&self, i: usize) -> Cow<'_, Polygon> {
+        ground(&self.stage, &self.state.members[i], i)
+    }
+
     /// Number of the start that environment `i` plays now; meaningful for [`Starts::Fixed`].
     pub fn start_number(&self, i: usize) -> u64 {
         self.draw_index(i, self.state.members[i].episode)
@@ -172,11 +201,20 @@ impl MotionEnv {
 
     fn restart(&mut self, seed: u64) -> Result<(), EnvError> {
         self.state.seed = seed;
-        (0..self.num_envs()).try_for_each(|i| self.begin(i, 0))
+        (0..self.num_envs()).try_for_each(|i| self.begin(i, 0))?;
+        if let Some(stage) = &mut self.stage {
+            stage.begin(&self.state.people);
+        }
+        Ok(())
     }
 
     /// Draws scene, start, seed motion and turn until the body's box is free of blocked cells.
     fn begin(&mut self, i: usize, episode: u64) -> Result<(), EnvError> {
+        if let Some(stage) = &self.stage {
+            let setting = stage.place(i, self.sim.body(), &mut self.state.people)?;
+            self.state.members[i] = Member::begin(episode, (None, setting), &self.state.people, i);
+            return Ok(());
+        }
         let purpose = if self.starts == Starts::Fixed { "fixed start" } else { "episode" };
         let mut rng = stream(self.state.seed, purpose, self.draw_index(i, episode));
         let noise = self.task.yaw_noise_deg.to_radians();
@@ -206,20 +244,26 @@ impl MotionEnv {
     fn write_obs(&self, obs: &mut [f32]) {
         let State { people, members, .. } = &self.state;
         let rows = obs.par_chunks_exact_mut(OBS).zip(members).with_min_len(CHUNK);
-        rows.enumerate().for_each(|(i, (row, member))| member.observe(&self.task, people, i, self.sim.model().origin(), row));
+        rows.enumerate().for_each(|(i, (row, member))| {
+            member.observe(&self.task, (people, i), &self.ground(i), self.sim.model().origin(), row);
+        });
     }
 
     /// Judges everyone after a step; returns who ended.
     fn judge(&mut self, out: &mut StepResult) -> Result<Vec<usize>, EnvError> {
         let State { people, members, .. } = &mut self.state;
         let (task, prims, people, judge) = ((&self.task, self.own.as_slice()), &self.prims, &*people, &self.judge);
-        let (names, crowd) = (&self.spec.info, &self.crowd);
+        let (names, crowd, stage) = (&self.spec.info, &self.crowd, &self.stage);
         let (terms, figures) = (out.info.par_chunks_exact_mut(names.len()), out.episode.par_chunks_exact_mut(EPISODE.len()));
         let each = (members, terms, figures, &mut out.reward, &mut out.terminated).into_par_iter().with_min_len(CHUNK);
         each.enumerate().for_each(|(i, (member, terms, episode, reward, ended))| {
+            if stage.as_ref().is_some_and(|stage| stage.done[i]) {
+                return;
+            }
             let natural = judge.as_ref().is_none_or(|j| j.natural(prims, i));
             let presence = crowd.as_ref().zip(member.room).map(|(crowd, room)| crowd.presence(room, people, prims, i));
-            let verdict = member.judge(task, &Step { people, prims, person: i, natural, presence }, terms, episode);
+            let blocked = if presence.is_some() { 0 } else { blocked(task.0, people, i, &ground(stage, member, i)) };
+            let verdict = member.judge(task, &Step { people, prims, person: i, natural, blocked, presence }, terms, episode);
             (*reward, *ended) = (verdict.reward, verdict.ended);
         });
         if let Some(i) = out.reward.iter().position(|r| !r.is_finite()) {
@@ -248,22 +292,36 @@ impl VecEnv for MotionEnv {
     fn step(&mut self, actions: &[f32], out: &mut StepResult) -> Result<(), EnvError> {
         self.spec.check_actions(self.num_envs(), actions)?;
         out.prepare(&self.spec, self.num_envs());
+        let held = self.stage.as_ref().map(Stage::held).unwrap_or_default();
+        let standing = self.state.people.select(&held);
         match self.task.latents {
             Some(k) => self.sim.step(&mut self.state.people, &self.sim.widen(actions, k)?, &mut self.prims)?,
             None => self.sim.step(&mut self.state.people, actions, &mut self.prims)?,
         }
+        self.state.people.put(&held, &standing);
+        if let Some(stage) = &mut self.stage {
+            stage.moved(&self.state.people);
+        }
         let ended = self.judge(out)?;
         self.write_obs(&mut out.final_obs);
         out.obs.copy_from_slice(&out.final_obs);
+        if let Some(stage) = &mut self.stage {
+            ended.into_iter().for_each(|i| stage.done[i] = true);
+            return Ok(());
+        }
         for i in ended {
             self.begin(i, self.state.members[i].episode + 1)?;
             let row = &mut out.obs[i * OBS..(i + 1) * OBS];
-            self.state.members[i].observe(&self.task, &self.state.people, i, self.sim.model().origin(), row);
+            let member = &self.state.members[i];
+            member.observe(&self.task, (&self.state.people, i), &member.setting.scene.walkable, self.sim.model().origin(), row);
         }
         Ok(())
     }
 
     fn save_state(&self) -> Result<Vec<u8>, EnvError> {
+        if self.stage.is_some() {
+            return Err(EnvError::Invalid("the state of given episodes cannot be saved".into()));
+        }
         let saved = (KIND, self.identity(), &self.state);
         postcard::to_stdvec(&saved).map_err(|e| EnvError::Invalid(format!("cannot save the motion environments: {e}")))
     }
@@ -297,6 +355,11 @@ impl VecEnv for MotionEnv {
         self.write_obs(obs);
         Ok(())
     }
+}
+
+fn ground<'a>(stage: &Option<Stage>, member: &'a Member, i: usize) -> Cow<'a, Polygon> {
+    let walkable = &member.setting.scene.walkable;
+    stage.as_ref().map_or(Cow::Borrowed(walkable), |stage| stage.ground(i, walkable))
 }
 
 fn spec(latent_dim: usize) -> EnvSpec {

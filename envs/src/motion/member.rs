@@ -34,6 +34,7 @@ pub(super) struct Member {
     min_dist: f32,
     path: f32,
     near_steps: u32,
+    hit: bool,
     inside: f32,
 }
 
@@ -44,6 +45,8 @@ pub(super) struct Step<'a> {
     pub person: usize,
     /// Its poses were natural.
     pub natural: bool,
+    /// Non-walkable cells under its box (eq. 7); not looked at in rooms.
+    pub blocked: usize,
     /// How much of it lay inside what stands in its room.
     pub presence: Option<Presence>,
 }
@@ -65,8 +68,8 @@ impl Member {
         Self { episode, setting, room, goal, dist, min_dist, ..Self::default() }
     }
 
-    /// Writes the observation row of person `i`; markers count from `origin`.
-    pub fn observe(&self, task: &MotionTask, people: &People, i: usize, origin: Origin, row: &mut [f32]) {
+    /// Writes the observation row of person `i`, who may walk on `ground`; markers count from `origin`.
+    pub fn observe(&self, task: &MotionTask, (people, i): (&People, usize), ground: &Polygon, origin: Origin, row: &mut [f32]) {
         let (state, rest) = row.split_at_mut(STATE);
         let (rays, scalars) = rest.split_at_mut(SEED * RAYS);
         let goal = people.frames[i].inverse().point(self.goal);
@@ -81,7 +84,7 @@ impl Member {
                 (goal - Vec3::from_slice(m)).normalize_or_zero().write_to_slice(to);
             }
         }
-        look_person(people, i, &self.setting.scene.walkable, rays);
+        look_person(people, i, ground, rays);
         scalars[0] = 1.0 / (1.0 + self.dist);
         scalars[1] = 1.0 - self.steps as f32 / task.max_depth as f32;
     }
@@ -90,7 +93,7 @@ impl Member {
     pub fn judge(
         &mut self,
         (task, own): (&MotionTask, &[OwnTerm]),
-        &Step { people, prims, person: i, natural, presence }: &Step,
+        &Step { people, prims, person: i, natural, blocked, presence }: &Step,
         terms: &mut [f32],
         episode: &mut [f32],
     ) -> Verdict {
@@ -112,7 +115,7 @@ impl Member {
             arrived: dist < task.success_distance,
             penetrates: match presence {
                 Some(p) => task.penetration.most.is_some_and(|most| p.most >= most),
-                None => blocked(task, people, i, &self.setting.scene.walkable) >= task.blocked_cells,
+                None => blocked >= task.blocked_cells,
             },
             crowded: presence.map(|p| p.reward(task.penetration.form)),
             left: task.max_depth - self.steps,
@@ -128,10 +131,11 @@ impl Member {
         self.total += reward;
         self.inside += presence.map_or(0.0, |p| p.count);
         self.near_steps += u32::from(dist < NEAR && !outcome.arrived);
+        self.hit |= outcome.penetrates;
         self.follow(prims, i);
-        let ended = outcome.arrived || outcome.penetrates || outcome.left == 0;
+        let ended = outcome.arrived || (outcome.penetrates && task.end_on_penetration) || outcome.left == 0;
         if ended {
-            episode.copy_from_slice(&self.figures(&outcome));
+            episode.copy_from_slice(&self.figures(outcome.arrived && !(outcome.penetrates && task.end_on_penetration)));
         }
         Verdict { reward, ended }
     }
@@ -152,10 +156,10 @@ impl Member {
         }
     }
 
-    fn figures(&self, o: &Outcome) -> [f32; EPISODE.len()] {
+    fn figures(&self, success: bool) -> [f32; EPISODE.len()] {
         [
-            f32::from(o.arrived && !o.penetrates),
-            f32::from(o.penetrates),
+            f32::from(success),
+            f32::from(self.hit),
             self.steps as f32,
             self.total,
             self.dist,

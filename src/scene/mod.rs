@@ -25,7 +25,7 @@ pub use pairs::{Pair, PairOptions, read_pairs, write_pairs};
 pub use paths::{Navigator, Route};
 pub use polygon::Polygon;
 pub use rooms::{Room, RoomKind, Rooms, Split};
-pub use sdf::{SdfGrid, SdfOptions};
+pub use sdf::{SdfGrid, SdfOptions, Solid};
 pub use sparse::{Setting, SparseKind, SparseScenes};
 pub use walkable::{Walkable, WalkableOptions, floor_height};
 

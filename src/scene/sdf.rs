@@ -2,9 +2,11 @@
 
 mod build;
 mod file;
+mod solid;
 mod tree;
 
 pub use build::SdfOptions;
+pub use solid::Solid;
 
 use crate::{Error, Result};
 use glam::{UVec3, Vec3};

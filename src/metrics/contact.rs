@@ -1,0 +1,127 @@
+//! Bodies in obstacles and in each other, from their vertices in the world.
+
+use crate::scene::{BoxObstacle, Polygon, Solid};
+use glam::Vec3;
+
+/// Width of the step of [`occupancy`], metres.
+const SOFT: f32 = 0.01;
+/// Beyond this from a surface an occupancy is below 0.0001, metres.
+const AWAY: f32 = 10.0 * SOFT;
+
+/// Whether the floor projection of any vertex lies off the walkable area: in an obstacle's outline or beyond the walls.
+pub fn meets_outline(vertices: &[Vec3], walkable: &Polygon) -> bool {
+    vertices.iter().any(|v| !walkable.contains(v.truncate().as_dvec2()))
+}
+
+/// Depth of the deepest vertex, metres, where `distance` is negative within obstacles; 0 where none is.
+pub fn deepest(vertices: &[Vec3], distance: impl Fn(Vec3) -> f32) -> f32 {
+    vertices.iter().fold(0.0, |deep, &v| f32::max(deep, -distance(v)))
+}
+
+/// Signed distance to a box that stands on the floor and reaches below it, metres: negative inside.
+pub fn box_distance(b: &BoxObstacle, p: Vec3) -> f32 {
+    let local = glam::Vec2::from_angle(-b.yaw).rotate(p.truncate() - b.centre).abs() - b.size / 2.0;
+    let out = local.extend(p.z - b.height);
+    out.max(Vec3::ZERO).length() + out.max_element().min(0.0)
+}
+
+/// Number of vertices inside another's body: those at which the winding number of its mesh is above a half.
+pub fn vertices_inside(vertices: &[Vec3], other: &Solid) -> usize {
+    near(vertices, other, 0.0).filter(|&v| other.contains(v)).count()
+}
+
+/// Mean over the vertices of 1 / (1 + exp(d / 1 cm)), d the signed distance to another's body (negative inside): 0 for bodies apart, and
+/// for one vertex 0.5 on the other's surface. Smooth in [0, 1], as learned occupancy fields are.
+pub fn occupancy(vertices: &[Vec3], other: &Solid) -> f32 {
+    let soft = |v: Vec3| 1.0 / (1.0 + (other.distance(v) / SOFT).exp());
+    near(vertices, other, AWAY).map(soft).sum::<f32>() / vertices.len().max(1) as f32
+}
+
+/// Vertices within `margin` of the bounds of `other`.
+fn near<'a>(vertices: &'a [Vec3], other: &Solid, margin: f32) -> impl Iterator<Item = Vec3> + 'a {
+    let (low, high) = other.bounds();
+    vertices.iter().copied().filter(move |v| v.cmpge(low - margin).all() && v.cmple(high + margin).all())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::body::{BETAS, BodyModel, PARAMS};
+    use glam::{DVec2, Vec2};
+    use serde_json::Value;
+
+    fn square(half: f64) -> Vec<DVec2> {
+        [(-half, -half), (half, -half), (half, half), (-half, half)].map(DVec2::from).to_vec()
+    }
+
+    /// The cube from -h to h.
+    fn cube(h: f32) -> Solid {
+        let b = BoxObstacle { centre: Vec2::ZERO, size: Vec2::splat(2.0 * h), yaw: 0.0, height: 2.0 * h };
+        let mesh = crate::render::Mesh::cuboid(b.centre, b.size / 2.0, b.yaw, b.height);
+        let vertices: Vec<Vec3> = mesh.vertices.iter().map(|v| *v - Vec3::Z * h).collect();
+        Solid::new(&vertices, &mesh.faces).unwrap()
+    }
+
+    #[test]
+    fn outlines_and_depths_by_hand() {
+        let floor = Polygon::new(square(3.0), vec![square(0.5)]).unwrap();
+        let at = |x: f32| Vec3::new(x, 0.0, 1.7);
+        assert!(!meets_outline(&[at(0.6), at(2.9)], &floor));
+        assert!(meets_outline(&[at(0.6), at(0.4)], &floor) && meets_outline(&[at(3.1)], &floor));
+        let b = BoxObstacle { centre: Vec2::new(1.0, 0.0), size: Vec2::new(1.0, 2.0), yaw: std::f32::consts::FRAC_PI_2, height: 2.0 };
+        // Turned by a quarter: 2 m along x, 1 m along y.
+        for (p, d) in [
+            (Vec3::new(1.0, 0.0, 1.0), -0.5),
+            (Vec3::new(1.0, 0.0, 1.9), -0.1),
+            (Vec3::new(1.8, 0.1, 0.5), -0.2),
+            (Vec3::new(2.3, 0.9, 0.5), 0.5),
+            (Vec3::new(1.0, 0.0, 3.0), 1.0),
+        ] {
+            assert!((box_distance(&b, p) - d).abs() < 1e-6, "{p}: {}", box_distance(&b, p));
+        }
+        assert_eq!(deepest(&[at(0.0), at(-1.0)], |p| p.x - 0.25), 1.25);
+        assert_eq!(deepest(&[at(1.0)], |p| p.x), 0.0);
+    }
+
+    #[test]
+    fn points_in_a_cube_by_hand() {
+        let solid = cube(0.5);
+        let points = [Vec3::ZERO, Vec3::new(0.45, 0.45, -0.45), Vec3::new(0.55, 0.0, 0.0), Vec3::new(3.0, 0.0, 0.0)];
+        assert_eq!(vertices_inside(&points, &solid), 2);
+        assert!((solid.distance(points[1]) + 0.05).abs() < 1e-6 && (solid.distance(points[2]) - 0.05).abs() < 1e-6);
+        // 5 cm are five widths: 1 / (1 + e^-5) and 1 / (1 + e^5); deep inside 1; beyond 10 cm nothing.
+        let want = (1.0 + 0.993_307 + 0.006_693) / 4.0;
+        assert!((occupancy(&points, &solid) - want).abs() < 1e-5, "{}", occupancy(&points, &solid));
+        assert!((occupancy(&[Vec3::new(0.5, 0.1, 0.1)], &solid) - 0.5).abs() < 1e-4);
+    }
+
+    /// Counts and distances by Open3D and trimesh: tests/tools/bodies/make.py.
+    #[test]
+    fn agrees_with_open3d_on_bodies() {
+        let file: Value = serde_json::from_str(include_str!("../../tests/fixtures/bodies/inside.json")).unwrap();
+        let numbers = |v: &Value| v.as_array().unwrap().iter().map(|x| x.as_f64().unwrap() as f32).collect::<Vec<_>>();
+        let model = BodyModel::embedded();
+        let skin = |v: &Value| {
+            let (params, betas) = (numbers(&v["params"]), numbers(&v["betas"]));
+            assert_eq!((params.len(), betas.len()), (PARAMS, BETAS));
+            let (shaped, mut out) = (model.shape(&betas), Vec::new());
+            model.skin(&shaped, &shaped.pose(&params), &mut out);
+            out
+        };
+        let cases = file.as_array().unwrap();
+        assert!(cases.len() >= 4);
+        for (i, case) in cases.iter().enumerate() {
+            let (a, b) = (skin(&case["a"]), skin(&case["b"]));
+            let solid = Solid::new(&b, model.faces()).unwrap();
+            let inside = vertices_inside(&a, &solid);
+            let want = case["inside"].as_u64().unwrap() as usize;
+            // Vertices within rounding of the surface may go either way.
+            assert!(inside.abs_diff(want) <= 1 + want / 500, "case {i}: {inside}, expected {want}");
+            for p in case["points"].as_array().unwrap() {
+                let p = numbers(p);
+                let d = solid.distance(Vec3::new(p[0], p[1], p[2]));
+                assert!((d - p[3]).abs() < 2e-5, "case {i}: {d}, expected {}", p[3]);
+            }
+        }
+    }
+}

@@ -23,9 +23,9 @@ fn baselines_are_reported_the_same_every_time() {
     let first = report("a");
     assert_eq!(first, report("b"));
     let json: serde_json::Value = serde_json::from_str(&first).unwrap();
-    assert_eq!(json["rows"].as_array().unwrap().len(), 3);
-    assert!(json["rows"][1]["contact"]["value"].as_f64().unwrap() > 0.5);
-    assert!(json["rows"][1]["kl"].is_null());
+    assert_eq!(json["scenarios"][0]["rows"].as_array().unwrap().len(), 3);
+    assert!(json["scenarios"][0]["rows"][1]["contact"]["value"].as_f64().unwrap() > 0.5);
+    assert!(json["scenarios"][0]["rows"][1]["kl"].is_null());
 }
 
 #[test]
@@ -59,6 +59,7 @@ fn mistakes_are_told() {
     fails(env!("CARGO_BIN_EXE_evaluate"), &["nowhere", "--no-baselines"], "nowhere");
     fails(env!("CARGO_BIN_EXE_evaluate"), &["--episodes", "0"], "--episodes");
     fails(env!("CARGO_BIN_EXE_evaluate"), &["--model", "nowhere"], "nowhere");
+    fails(env!("CARGO_BIN_EXE_evaluate"), &["--scenario", "circle-3"], "circle-16");
     fails(env!("CARGO_BIN_EXE_evaluate"), &["--set", "pose.prior=gone.safetensors"], "gone.safetensors");
     fails(env!("CARGO_BIN_EXE_play"), &["nowhere"], "nowhere");
     fails(env!("CARGO_BIN_EXE_curves"), &["nowhere"], "metrics.csv");

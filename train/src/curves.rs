@@ -61,12 +61,13 @@ pub struct Baseline {
 }
 
 impl Baseline {
-    /// The rows of a report without a KL, which are the baselines.
+    /// The rows of a report's first scenario without a KL, which are the baselines.
     pub fn read(path: &Path) -> Result<Vec<Self>> {
         let bad = |e: String| Error::config(format!("{}: {e}", path.display()));
         let text = std::fs::read_to_string(path).map_err(|e| bad(e.to_string()))?;
         let report: serde_json::Value = serde_json::from_str(&text).map_err(|e| bad(e.to_string()))?;
-        let rows = report["rows"].as_array().ok_or_else(|| bad("has no list 'rows'; not a report of evaluate".into()))?;
+        let rows = report["scenarios"][0]["rows"].as_array();
+        let rows = rows.ok_or_else(|| bad("has no scenario with 'rows'; not a report of this evaluate".into()))?;
         let figures = |row: &serde_json::Value| {
             row.as_object().into_iter().flatten().filter_map(|(k, v)| Some((k.clone(), v["value"].as_f64()?))).collect()
         };

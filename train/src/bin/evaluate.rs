@@ -3,13 +3,16 @@
 use clap::Parser;
 use egogen::agent::bundle::Bundle;
 use egogen::io::write_atomic;
-use egogen_envs::motion::MotionEnv;
-use egogen_train::evaluate::{Actor, Greedy, Row, play, table};
+use egogen_train::evaluate::{Actor, Greedy, Row, Scenario, Setup, play, shipped, table};
 use egogen_train::program::{self, Given};
 use egogen_train::{Error, Result};
+use serde_json::json;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::process::ExitCode;
+
+/// Layout of report.json; counts up when it changes.
+const FORMAT: u32 = 2;
 
 /// Plays policies and baselines from the same held-out starts and reports figures with 95 % intervals.
 #[derive(Debug, Parser)]
@@ -18,6 +21,8 @@ use std::process::ExitCode;
     version,
     after_help = "Examples:
   evaluate checkpoints/policy/quick --out runs/evaluation     a policy beside the three baselines
+  evaluate checkpoints/policy/quick --scenario circle-4 --scenario moving
+  evaluate checkpoints/policy/quick --scenario all --scenario mine.toml --scenario scenes/office
   evaluate runs/quick/policy runs/other/policy --episodes 500
   evaluate --set scene.kind=open --set scene.min_distance=2     baselines where nothing is in the way
 
@@ -26,9 +31,13 @@ Exit codes: 0 done, 1 failed while running, 2 bad usage, task, model or policy."
 struct Args {
     /// Policy bundles; each is played with its noise and with its mean action
     policies: Vec<PathBuf>,
-    /// Starts, the same for everyone
-    #[arg(long, default_value = "200")]
-    episodes: NonZeroUsize,
+    /// What is played: box (the walking task, without any other the only one), midpoint, moving, circle-2, circle-4, circle-8,
+    /// circle-16, rooms, rooms-two, all (these nine), a TOML file of one's own or the folder of a scene bundle; repeatable
+    #[arg(long = "scenario", value_name = "NAME|FILE|DIR", default_values = ["box"])]
+    scenarios: Vec<String>,
+    /// Episodes of each scenario, the same for everyone, instead of as many as it says
+    #[arg(long)]
+    episodes: Option<NonZeroUsize>,
     /// Seed of the starts and of all noise
     #[arg(long, default_value_t = 2024)]
     seed: u64,
@@ -41,6 +50,9 @@ struct Args {
     /// Leave the baselines out
     #[arg(long)]
     no_baselines: bool,
+    /// Each policy once more without egosensing: every ray at its full length
+    #[arg(long)]
+    blind: bool,
     /// Folder for report.json and report.md
     #[arg(long, value_name = "DIR", default_value = "runs/evaluation")]
     out: PathBuf,
@@ -51,10 +63,51 @@ fn main() -> ExitCode {
 }
 
 fn run(args: &Args) -> Result<u8> {
-    let episodes = args.episodes.get();
     let world = program::world(args.model.as_deref())?;
     let task = program::task(&args.set)?;
-    let mut env = MotionEnv::evaluation(task, world.sim.clone(), world.held_out.clone(), episodes, args.seed).given()?;
+    let mut setups = scenarios(args)?.into_iter().map(|s| Setup::new(s, &task, &world, args.seed)).collect::<Result<Vec<_>>>()?;
+    let actors = actors(args, &setups)?;
+    let (mut text, mut told) = (String::new(), Vec::new());
+    for setup in &mut setups {
+        let scenario = setup.scenario.clone();
+        let mut rows = Vec::new();
+        for (name, actor) in &actors {
+            eprintln!("{}: {name}, {} episodes", scenario.name, setup.place.len());
+            rows.push(Row::new(name, &play(&mut setup.env, actor, args.seed, false)?));
+        }
+        text += &format!("## {}\n\n{}.\n\n{}\n", scenario.name, scenario.about, table(&rows));
+        let task = setup.env.task();
+        told.push(json!({"name": scenario.name, "scenario": scenario, "task": task, "episodes": setup.place.len(), "rows": rows}));
+    }
+    println!("{text}");
+    let report = json!({"format": FORMAT, "seed": args.seed, "origin": world.origin(), "scenarios": told});
+    write_atomic(args.out.join("report.json"), format!("{report:#}").as_bytes())?;
+    write_atomic(args.out.join("report.md"), text.as_bytes())?;
+    Ok(0)
+}
+
+/// The scenarios asked for, each once.
+fn scenarios(args: &Args) -> Result<Vec<Scenario>> {
+    let mut found: Vec<Scenario> = Vec::new();
+    for name in &args.scenarios {
+        let names: Vec<&str> = if name == "all" { shipped().collect() } else { vec![name] };
+        for scenario in names.into_iter().map(Scenario::find) {
+            let scenario = match args.episodes {
+                Some(n) => scenario?.with_episodes(n.get()),
+                None => scenario?,
+            };
+            match found.iter().find(|s| s.name == scenario.name) {
+                Some(same) if *same != scenario => return Err(Error::config(format!("two scenarios are called '{}'", scenario.name))),
+                Some(_) => {}
+                None => found.push(scenario),
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// Baselines and policies by name.
+fn actors(args: &Args, setups: &[Setup]) -> Result<Vec<(String, Actor)>> {
     let mut actors: Vec<(String, Actor)> = Vec::new();
     if !args.no_baselines {
         actors.push(("latents 0".into(), Actor::Zero));
@@ -65,22 +118,15 @@ fn run(args: &Args) -> Result<u8> {
     for dir in &args.policies {
         let bundle = Bundle::read(dir).given()?;
         let name = if bundle.trained.recipe.is_empty() { dir.display().to_string() } else { bundle.trained.recipe.clone() };
-        for (noise, how) in [(true, "stochastic"), (false, "deterministic")] {
-            let actor = Actor::policy(&bundle, &env, noise).map_err(|e| Error::config(format!("policy {}: {e}", dir.display())))?;
+        let ways = [(true, false, "stochastic"), (false, false, "deterministic"), (false, true, "deterministic, no egosensing")];
+        for (noise, blind, how) in ways.into_iter().filter(|way| args.blind || !way.1) {
+            let refused = |e| Error::config(format!("policy {}: {e}", dir.display()));
+            let mut actor = Actor::policy(&bundle, &setups[0].env, noise).map_err(refused)?;
+            if blind {
+                actor = actor.blind();
+            }
             actors.push((format!("{name}, {how}"), actor));
         }
     }
-    let mut rows = Vec::new();
-    for (name, actor) in &actors {
-        eprintln!("{name}: {episodes} episodes");
-        rows.push(Row::new(name, &play(&mut env, actor, args.seed, false)?));
-    }
-    let text = table(&rows);
-    println!("{text}");
-    let json = serde_json::json!({
-        "episodes": episodes, "seed": args.seed, "task": env.task(), "origin": world.origin(), "rows": rows,
-    });
-    write_atomic(args.out.join("report.json"), format!("{json:#}").as_bytes())?;
-    write_atomic(args.out.join("report.md"), text.as_bytes())?;
-    Ok(0)
+    Ok(actors)
 }

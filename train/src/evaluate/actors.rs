@@ -1,18 +1,24 @@
 //! Who chooses the latents.
 
-use crate::{Compute, Policy, Result};
+use super::way::Way;
+use crate::{Compute, Error, Policy, Result};
+use egogen::agent::ObsGroup;
 use egogen::agent::bundle::Bundle;
 use egogen::body::{JOINTS, canonical_frame, joint};
 use egogen::metrics::{kl_mean_only, kl_to_standard};
 use egogen::motion::{FUTURE, SEED};
 use egogen::rng::stream;
+use egogen::scene::Polygon;
 use egogen::sim::{People, Primitives};
+use egogen_envs::VecEnv;
 use egogen_envs::motion::{MotionEnv, blocked};
 use glam::{Vec2, Vec3};
 use rand_distr::{Distribution, StandardNormal};
 
 /// Stream of all noise in evaluation.
 const NOISE: &str = "evaluation noise";
+/// What the rays are called in an observation.
+const EGOSENSING: &str = "egosensing";
 
 /// Latents for everyone, and for policies the divergence of each person's action distribution from N(0, I).
 #[derive(Default)]
@@ -27,8 +33,8 @@ pub struct Choice {
 
 /// Something that walks: a policy or a baseline.
 pub enum Actor {
-    /// A trained policy, with its noise or with its mean action.
-    Policy { policy: Box<Policy>, noise: bool },
+    /// A trained policy, with its noise or with its mean action; `blind`: told that nothing is in sight.
+    Policy { policy: Box<Policy>, noise: bool, blind: bool },
     /// The latent 0: the motion model's most ordinary continuation.
     Zero,
     /// Latents from N(0, I): the motion model wandering.
@@ -38,12 +44,25 @@ pub enum Actor {
 }
 
 impl Actor {
-    /// The policy of a bundle; refused when it was trained on another motion model or body than `env` has.
+    /// The policy of a bundle; refused when it was trained on another motion model or body than `env` has, or sees something else.
     pub fn policy(bundle: &Bundle, env: &MotionEnv, noise: bool) -> Result<Self> {
         bundle.require("motion", env.sim().model().hash())?;
         bundle.require("body", env.sim().body().hash())?;
+        let shapes = |groups: &[ObsGroup]| groups.iter().map(|g| format!("{} {:?}", g.name, g.shape)).collect::<Vec<_>>().join(", ");
+        let (seen, shown) = (shapes(&bundle.spec.layout.groups), shapes(&env.spec().obs));
+        if seen != shown {
+            return Err(Error::config(format!("it sees {seen}, but the walking task shows {shown}; train it anew")));
+        }
         env.sim().widen(&[], bundle.spec.action.count())?;
-        Ok(Self::Policy { policy: Box::new(Policy::new(&bundle.spec, &bundle.params, &Compute::Own)?), noise })
+        Ok(Self::Policy { policy: Box::new(Policy::new(&bundle.spec, &bundle.params, &Compute::Own)?), noise, blind: false })
+    }
+
+    /// A policy that is told nothing of what is in sight; baselines stay as they are.
+    pub fn blind(mut self) -> Self {
+        if let Self::Policy { blind, .. } = &mut self {
+            *blind = true;
+        }
+        self
     }
 
     /// Latents for everyone in `env`, who sees `obs`; people not `playing` any more may get any. `seed` and `step` fix the noise.
@@ -51,8 +70,8 @@ impl Actor {
         let people = env.people();
         let dim = env.sim().model().latent_dim();
         match self {
-            Self::Policy { policy, noise } => {
-                let acts = policy.act(obs)?;
+            Self::Policy { policy, noise, blind } => {
+                let acts = if *blind { policy.act(&blinded(env, obs))? } else { policy.act(obs)? };
                 let k = policy.actions();
                 let rows = || acts.mu.chunks_exact(k).zip(acts.logvar.chunks_exact(k));
                 Ok(Choice {
@@ -68,13 +87,22 @@ impl Actor {
     }
 }
 
+/// Observation rows with every ray at its full length.
+fn blinded(env: &MotionEnv, obs: &[f32]) -> Vec<f32> {
+    let (mut out, spec) = (obs.to_vec(), env.spec());
+    let before: usize = spec.obs.iter().take_while(|g| g.name != EGOSENSING).map(ObsGroup::len).sum();
+    let rays = spec.obs.iter().find(|g| g.name == EGOSENSING).map_or(0, ObsGroup::len);
+    out.chunks_exact_mut(spec.obs_dim()).for_each(|row| row[before..before + rays].fill(1.0));
+    out
+}
+
 /// n rows of standard normal noise; row i of a step has a stream of its own.
 fn normal(n: usize, dim: usize, seed: u64, step: u64) -> Vec<f32> {
     let row = |i: usize| StandardNormal.sample_iter(stream(seed, NOISE, step * n as u64 + i as u64)).take(dim);
     (0..n).flat_map(row).collect()
 }
 
-/// One-step search: every latent is tried in the simulation.
+/// One-step search: every latent is tried in the simulation, and judged by how far it leads along the shortest way round what stands still.
 pub struct Greedy {
     /// Latents tried per person and step.
     pub candidates: usize,
@@ -100,27 +128,32 @@ impl Greedy {
             let latents: Vec<f32> = group.iter().flat_map(|&i| normal(self.candidates, dim, seed, step * n as u64 + i as u64)).collect();
             env.sim().step(&mut people, &latents, &mut prims)?;
             for (g, &i) in group.iter().enumerate() {
-                let cost = |k: usize| self.cost(env, i, &people, g * self.candidates + k);
-                let best = (0..self.candidates).min_by(|&a, &b| cost(a).total_cmp(&cost(b))).unwrap_or(0);
+                let setting = env.setting(i);
+                let way = Way::plan(&setting.scene.walkable, Stance::of(env.people(), i).at, setting.goal);
+                let ground = env.ground(i);
+                let costs: Vec<f32> =
+                    (0..self.candidates).map(|k| cost(env, (&way, &ground, setting.goal), &people, g * self.candidates + k)).collect();
+                let best = (0..self.candidates).min_by(|&a, &b| costs[a].total_cmp(&costs[b])).unwrap_or(0);
                 let at = (g * self.candidates + best) * dim;
                 chosen[i * dim..(i + 1) * dim].copy_from_slice(&latents[at..at + dim]);
             }
         }
         Ok(chosen)
     }
+}
 
-    /// See [`greedy_cost`]; a step that arrives comes first, one that hits something last.
-    fn cost(&self, env: &MotionEnv, i: usize, people: &People, row: usize) -> f32 {
-        let (setting, task) = (env.setting(i), env.task());
-        let stance = Stance::of(people, row);
-        let to = setting.goal - stance.at;
-        if blocked(task, people, row, &setting.scene.walkable) >= task.blocked_cells {
-            1e3 + to.length()
-        } else if to.length() < task.success_distance {
-            to.length() - 1e3
-        } else {
-            greedy_cost(to.length(), stance.forward.angle_to(to), stance.stride)
-        }
+/// See [`greedy_cost`]; a step that arrives comes first, one that hits something last.
+fn cost(env: &MotionEnv, (way, ground, goal): (&Way, &Polygon, Vec2), people: &People, row: usize) -> f32 {
+    let task = env.task();
+    let stance = Stance::of(people, row);
+    let (left, ahead) = way.follow(stance.at);
+    let missing = stance.at.distance(goal);
+    if blocked(task, people, row, ground) >= task.blocked_cells {
+        1e3 + left
+    } else if missing < task.success_distance {
+        missing - 1e3
+    } else {
+        greedy_cost(left, stance.forward.angle_to(ahead - stance.at), stance.stride)
     }
 }
 

@@ -3,14 +3,13 @@
 use super::{Navigator, Pair, PairOptions, Room, RoomKind, Rooms, Scene, SdfGrid, SdfOptions, Setting, Split, TriMesh};
 use crate::rng::{Stream, stream};
 use crate::{Error, Result};
-use glam::Vec3;
 use rand::RngExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::sync::{Arc, Mutex};
 
-/// Height at which the start of a pair is surely free space, metres.
-const FREE: f32 = 1.0;
+/// Height that people do not reach, metres; distances are not kept above it.
+const REACH: f32 = 2.2;
 
 /// How crowded scenes are drawn.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -86,8 +85,8 @@ impl CrowdedScene {
     /// A room with its distances, and pairs drawn by `seed`.
     pub fn new(room: Room, pairs: &PairOptions, voxel: f32, seed: u64) -> Result<Self> {
         let pairs = pairs.draw(&Navigator::new(&room.walkable, pairs.clearance.into())?, seed)?;
-        let free: Vec<Vec3> = pairs.iter().take(9).map(|p| p.start.extend(FREE)).collect();
-        let sdf = SdfGrid::build(&room.mesh, &SdfOptions { voxel, free, ..SdfOptions::default() })?;
+        let layout = SdfOptions { voxel, top: Some(REACH), ..SdfOptions::for_floor(&room.walkable, 0.0)? };
+        let sdf = SdfGrid::build(&room.mesh, &layout)?;
         Ok(Self { name: room.name, scene: Scene { walkable: room.walkable, obstacles: Vec::new() }, mesh: room.mesh, sdf, pairs })
     }
 

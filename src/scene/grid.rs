@@ -73,6 +73,12 @@ impl Grid {
         self.lowest + (DVec2::new(i as f64, j as f64) + 0.5) * self.cell
     }
 
+    /// Centres of the set cells, metres.
+    pub fn centres(&self) -> impl Iterator<Item = DVec2> {
+        let set = self.cells.iter().enumerate().filter(|(_, set)| **set);
+        set.map(|(k, _)| self.centre(k % self.dims[0], k / self.dims[0]))
+    }
+
     /// Whether the cell of `p` is set.
     pub fn holds(&self, p: DVec2) -> bool {
         let at = (p - self.lowest) / self.cell;
@@ -256,6 +262,8 @@ mod tests {
         let grid = Grid::of_polygon(&Polygon::new(ring(2.05), vec![ring(0.55)]).unwrap(), 0.1).unwrap();
         // Centres at multiples of 0.1 m: 41 x 41 of them less 11 x 11.
         assert!((grid.area() - 15.6).abs() < 1e-9, "{}", grid.area());
+        assert_eq!(grid.centres().count(), 1560);
+        assert!(grid.centres().all(|p| p.abs().max_element() < 2.05 && p.abs().max_element() > 0.55));
         let at = |x: f64, y: f64| grid.holds(DVec2::new(x, y));
         assert!(at(1.0, 1.0) && !at(0.0, 0.0) && !at(2.2, 0.0) && at(0.0, -1.8));
         assert!(Grid::covering(DVec2::ZERO, DVec2::splat(1e6), 0.01, 0.0).is_err());

@@ -97,11 +97,7 @@ impl SceneBundle {
     fn measure(&mut self, options: &MakeOptions, stages: Stages) -> Result<()> {
         stages("signed distances");
         let Some(mesh) = self.mesh.as_ref().filter(|_| options.voxel != 0.0) else { return Ok(()) };
-        // Some of the walkable floor, 1 m up: what is free space there.
-        let grid = Grid::of_polygon(&self.walkable, 0.5)?;
-        let cells = (0..grid.cells.len()).filter(|&k| grid.cells[k]).map(|k| grid.centre(k % grid.dims[0], k / grid.dims[0]));
-        let free = cells.map(|p| p.as_vec2().extend(self.floor + 1.0)).collect();
-        let layout = SdfOptions { voxel: options.voxel, floor: Some(self.floor), free, ..Default::default() };
+        let layout = SdfOptions { voxel: options.voxel, ..SdfOptions::for_floor(&self.walkable, self.floor)? };
         self.sdf = Some(SdfGrid::build(mesh, &layout)?);
         Ok(())
     }

@@ -1,7 +1,10 @@
 //! Signed distance to what stands in a scene, sampled on a grid.
 
+mod blocks;
 mod build;
+mod face;
 mod file;
+mod inside;
 mod solid;
 mod tree;
 
@@ -60,6 +63,12 @@ impl SdfGrid {
     /// Centre of a voxel, metres.
     pub fn centre(&self, voxel: [usize; 3]) -> Vec3 {
         self.lowest + self.voxel * Vec3::from(voxel.map(|i| i as f32))
+    }
+
+    /// The voxel of a value.
+    fn voxel_of(&self, value: usize) -> [usize; 3] {
+        let [_, ny, nz] = self.dims;
+        [value / (ny * nz), value / nz % ny, value % nz]
     }
 
     /// The distance at `p`, metres, trilinear between voxel centres.

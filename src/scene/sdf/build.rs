@@ -1,15 +1,17 @@
 //! Distances from a mesh.
 
+use super::blocks::{BLOCK, SLACK, Search, Slab};
+use super::inside::Surfaces;
 use super::tree::{Tree, Tri};
 use super::{MAX_SAMPLES, SdfGrid};
-use crate::scene::TriMesh;
+use crate::scene::{Grid, Polygon, TriMesh};
 use crate::{Error, Result};
 use glam::Vec3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Triangles wholly within this height of the floor, metres, belong to it: what a scan's noise, rugs and boxes' undersides need.
-const FLOOR: f32 = 0.02;
+pub(super) const FLOOR: f32 = 0.02;
 /// Below this height over the floor, metres, the scene is taken as it is at this height.
 const ABOVE: f32 = 0.03;
 
@@ -24,6 +26,8 @@ pub struct SdfOptions {
     /// Height of the floor, metres, which is no obstacle: triangles within 2 cm of it are left out, and what is less than 3 cm above the
     /// floor or beneath it is as it is 3 cm above. None: there is no floor.
     pub floor: Option<f32>,
+    /// Height of the highest voxel centres, metres; None: the margin above the mesh.
+    pub top: Option<f32>,
     /// Points in free space, such as some of the walkable floor 1 m up. Needed if the mesh is a room's shell, whose inside is free; without
     /// them free space is what no surface encloses.
     pub free: Vec<Vec3>,
@@ -31,11 +35,19 @@ pub struct SdfOptions {
 
 impl Default for SdfOptions {
     fn default() -> Self {
-        Self { voxel: 0.05, margin: 0.2, floor: Some(0.0), free: Vec::new() }
+        Self { voxel: 0.05, margin: 0.2, floor: Some(0.0), top: None, free: Vec::new() }
     }
 }
 
 impl SdfOptions {
+    /// Of a room with this walkable area and the floor at this height: what is 1 m above the one on the other is free space.
+    ///
+    /// Errors: an area too large to be laid out in cells.
+    pub fn for_floor(walkable: &Polygon, floor: f32) -> Result<Self> {
+        let free = Grid::of_polygon(walkable, 0.5)?.centres().map(|p| p.as_vec2().extend(floor + 1.0)).collect();
+        Ok(Self { floor: Some(floor), free, ..Self::default() })
+    }
+
     /// Sets the voxel so that `cells` of them reach over the longest side of `mesh` and its margin.
     pub fn with_cells(self, mesh: &TriMesh, cells: usize) -> Self {
         let longest = mesh.bounds().map_or(0.0, |(low, high)| (high - low).max_element()) + 2.0 * self.margin;
@@ -52,7 +64,15 @@ impl SdfOptions {
         if let Some(p) = self.free.iter().find(|p| !p.is_finite()) {
             return Err(Error::invalid(format!("free point {p} of a distance grid: expected finite metres")));
         }
-        let extent = high - low + 2.0 * self.margin;
+        let (low, mut high) = (low - self.margin, high + self.margin);
+        if let Some(top) = self.top {
+            if !top.is_finite() || top <= low.z {
+                let lowest = low.z;
+                return Err(Error::invalid(format!("top = {top} of a distance grid: expected a height above its lowest, {lowest} m")));
+            }
+            high.z = high.z.min(top);
+        }
+        let extent = high - low;
         // A hair less than a whole voxel is rounding.
         let dims = extent.to_array().map(|e| ((e / self.voxel - 1e-4).ceil().max(1.0) as usize).saturating_add(1));
         let count = dims.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
@@ -60,11 +80,11 @@ impl SdfOptions {
             let what = format!("a distance grid of {dims:?} voxels of {} m over {extent} m has more than {MAX_SAMPLES}", self.voxel);
             return Err(Error::invalid(format!("{what}; take a larger voxel")));
         }
-        Ok((low - self.margin, dims))
+        Ok((low, dims))
     }
 
     /// The point that stands for `p`: beneath the floor the scene goes on as it is just above it.
-    fn above_floor(&self, p: Vec3) -> Vec3 {
+    pub(super) fn above_floor(&self, p: Vec3) -> Vec3 {
         p.with_z(p.z.max(self.floor.map_or(f32::MIN, |floor| floor + ABOVE)))
     }
 }
@@ -94,32 +114,26 @@ impl SdfGrid {
         if obstacles.is_empty() {
             return Err(Error::invalid("the mesh is nothing but floor: there is no obstacle to measure distances to"));
         }
-        let floor = obstacles.len() < all.len();
-        let (obstacles, with_floor) = rayon::join(|| Tree::new(obstacles), || floor.then(|| Tree::new(all)));
+        let (obstacles, surfaces) = rayon::join(|| Tree::new(obstacles), || Surfaces::new(all));
         let mut grid = Self { lowest, voxel: options.voxel, dims, values: vec![0.0; dims.iter().product()] };
-        let excess = grid.measure(&obstacles, with_floor.as_ref().unwrap_or(&obstacles), options);
-        grid.nearer(grid.caps(&excess), options);
+        grid.measure(&obstacles, options);
+        let excess = surfaces.excess(&grid, options);
+        if !surfaces.are_closed() {
+            grid.nearer(grid.caps(&excess), options);
+        }
         grid.values.par_iter_mut().zip(&excess).for_each(|(value, &excess)| *value = if excess > 0.0 { -*value } else { *value });
         grid.check()?;
         Ok(grid)
     }
 
-    /// Fills in the distances to obstacles, without sign; gives by how much the winding number of each centre is more than a half away
-    /// from that of free space: above 0 within obstacles.
-    fn measure(&mut self, obstacles: &Tree, all: &Tree, options: &SdfOptions) -> Vec<f32> {
-        let free = free_winding(all, options);
-        let (mut excess, height) = (vec![0.0; self.values.len()], self.dims[2]);
-        self.rows().zip(excess.par_chunks_mut(height)).for_each_init(Scratch::default, |scratch, ((row, values), excess)| {
-            let mut bound = f32::INFINITY;
-            for (k, (value, excess)) in values.iter_mut().zip(excess).enumerate() {
-                let p = options.above_floor(row + Vec3::Z * (k as f32 * options.voxel));
-                *value = obstacles.distance_squared(p, bound * bound, &mut scratch.distances).sqrt();
-                // The next centre is one voxel away; a little more, so that rounding does not make the bound the answer.
-                bound = (*value + options.voxel) * 1.001;
-                *excess = (all.winding(p, &mut scratch.nodes) - free).abs() - 0.5;
-            }
+    /// Fills in the distances to obstacles, without sign.
+    fn measure(&mut self, tree: &Tree, options: &SdfOptions) {
+        let (lowest, [_, ny, nz]) = (self.lowest, self.dims);
+        let slabs = self.values.par_chunks_mut(BLOCK * ny * nz).enumerate();
+        slabs.for_each_init(Search::default, |search, (i, values)| {
+            let lowest = lowest + Vec3::X * ((i * BLOCK) as f32 * options.voxel);
+            Slab { tree, options, lowest, dims: [values.len() / (ny * nz), ny, nz], values }.fill(search);
         });
-        excess
     }
 
     /// Lessens the distances to those of `points`.
@@ -128,10 +142,10 @@ impl SdfGrid {
             return;
         }
         let tree = Tree::new(points);
-        self.rows().for_each_init(Scratch::default, |scratch, (row, values)| {
+        self.rows().for_each_init(Vec::new, |open, (row, values)| {
             for (k, value) in values.iter_mut().enumerate() {
                 let p = options.above_floor(row + Vec3::Z * (k as f32 * options.voxel));
-                *value = tree.distance_squared(p, *value * *value, &mut scratch.distances).sqrt();
+                *value = tree.distance_squared(p, *value * *value, open).sqrt();
             }
         });
     }
@@ -155,7 +169,7 @@ impl SdfGrid {
                     let second = (voxel[axis] + 1 < self.dims[axis]).then_some(first + strides[axis])?;
                     let (a, b) = (excess[first], excess[second]);
                     // A surface between two centres is at most a voxel away from both together.
-                    let parted = self.values[first] + self.values[second] <= 1.001 * self.voxel;
+                    let parted = self.values[first] + self.values[second] <= SLACK * self.voxel;
                     let t = a / (a - b);
                     ((a > 0.0) != (b > 0.0) && !parted).then(|| Tri([self.centre(voxel) + Vec3::AXES[axis] * (t * self.voxel); 3]))
                 })
@@ -163,19 +177,4 @@ impl SdfGrid {
         };
         (0..nx).into_par_iter().flat_map_iter(slab).collect()
     }
-}
-
-/// Memory of one thread.
-#[derive(Default)]
-struct Scratch {
-    distances: Vec<(f32, u32)>,
-    nodes: Vec<u32>,
-}
-
-/// The winding number of free space.
-fn free_winding(all: &Tree, options: &SdfOptions) -> f32 {
-    let mut scratch = Vec::new();
-    let mut numbers: Vec<f32> = options.free.iter().map(|&p| all.winding(options.above_floor(p), &mut scratch)).collect();
-    numbers.sort_by(f32::total_cmp);
-    numbers.get(numbers.len() / 2).copied().unwrap_or(0.0)
 }

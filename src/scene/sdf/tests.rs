@@ -3,6 +3,7 @@ use super::tree::{Tree, Tri};
 use super::*;
 use crate::scene::mesh::{MeshOptions, read_mesh};
 use crate::scene::{RoomKind, Rooms, TriMesh};
+use glam::{Affine3A, Quat};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 
@@ -11,7 +12,7 @@ fn fixture(name: &str) -> PathBuf {
 }
 
 fn options(voxel: f32, margin: f32, floor: Option<f32>) -> SdfOptions {
-    SdfOptions { voxel, margin, floor, free: Vec::new() }
+    SdfOptions { voxel, margin, floor, ..Default::default() }
 }
 
 fn boxes(boxes: &[(Vec3, Vec3)]) -> TriMesh {
@@ -32,8 +33,7 @@ fn room() -> TriMesh {
 }
 
 fn each(grid: &SdfGrid) -> impl Iterator<Item = (Vec3, f32)> {
-    let [_, ny, nz] = grid.dims;
-    grid.values.iter().enumerate().map(move |(i, &v)| (grid.centre([i / (ny * nz), i / nz % ny, i % nz]), v))
+    grid.values.iter().enumerate().map(|(i, &v)| (grid.centre(grid.voxel_of(i)), v))
 }
 
 /// Signed distance of an upright box: outside the length of what sticks out, inside the least way to a side.
@@ -143,6 +143,99 @@ fn distances_as_open3d_has_them() {
         println!("{}: winding numbers within {}, distances within {}, {bent} near an opening", g.file, worst[0], worst[1]);
         assert!(worst[0] < 0.05 && worst[1] < 1e-5, "{}: {worst:?}", g.file);
     }
+}
+
+#[derive(Deserialize)]
+struct GoldenRoom {
+    lowest: Vec3,
+    voxel: f32,
+    dims: [usize; 3],
+    /// Of some of the values.
+    numbers: Vec<usize>,
+    values: Vec<f32>,
+    free: Vec<Vec3>,
+}
+
+#[derive(Deserialize)]
+struct Furnished {
+    pieces: Vec<Placed>,
+    #[serde(flatten)]
+    grid: GoldenRoom,
+}
+
+/// A piece of furniture in the archive and where it stands.
+#[derive(Deserialize)]
+struct Placed {
+    file: String,
+    yaw: f32,
+    at: Vec3,
+}
+
+/// Furniture of others on a floor that is a sheet; values as before.
+#[test]
+fn furniture_on_a_floor_as_open3d_has_it() {
+    let shared = std::env::var_os("EGOGEN_SHARED").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
+    let archive = shared.join("data/scenes.tar.gz");
+    if !archive.is_file() {
+        println!("skipped: no {} (set EGOGEN_SHARED)", archive.display());
+        return;
+    }
+    let dir = tempfile::tempdir().unwrap();
+    assert!(std::process::Command::new("tar").arg("xzf").arg(archive).arg("-C").arg(dir.path()).status().unwrap().success());
+    let golden: Furnished = serde_json::from_slice(&std::fs::read(fixture("furnished.json")).unwrap()).unwrap();
+    let mut mesh = TriMesh::new();
+    let (object, material) = (mesh.add_object("floor"), mesh.add_material("wood", [1.0; 4]));
+    mesh.add_quad(object, material, [(-3.0, -3.0), (3.0, -3.0), (3.0, 3.0), (-3.0, 3.0)].map(|(x, y)| Vec3::new(x, y, 0.0)));
+    for piece in &golden.pieces {
+        let read = read_mesh(dir.path().join("scenes").join(&piece.file), &MeshOptions::default()).unwrap().mesh;
+        mesh.append(&read, Affine3A::from_rotation_translation(Quat::from_rotation_z(piece.yaw), piece.at));
+    }
+    let golden = golden.grid;
+    let options = SdfOptions { free: golden.free, ..options(golden.voxel, 0.2, Some(0.0)) };
+    let grid = SdfGrid::sample(&mesh, &options, golden.lowest, golden.dims).unwrap();
+    let (mut inside, mut nearer) = (0, 0);
+    for (&i, &want) in golden.numbers.iter().zip(&golden.values) {
+        let (got, p) = (grid.values[i], grid.centre(grid.voxel_of(i)));
+        assert!((got < 0.0) == (want < 0.0) || want.abs() < 1e-5, "{p}: {got}, expected {want}");
+        // Holes that are closed count as surface as well, so that no distance is larger.
+        assert!(got.abs() <= want.abs() + 2e-5, "{p}: {got}, expected {want}");
+        nearer += usize::from(got.abs() < want.abs() - 2e-5);
+        inside += usize::from(want < 0.0);
+    }
+    println!("{} values, {inside} inside, {nearer} of them nearer to a hole", golden.numbers.len());
+    assert!(inside > 30 && nearer < golden.numbers.len() / 20, "{nearer}");
+}
+
+/// Values by Open3D and summed-up solid angles: tests/tools/scenes/rooms.py.
+#[test]
+fn a_furnished_room_as_open3d_has_it() {
+    let golden: GoldenRoom = serde_json::from_slice(&std::fs::read(fixture("rooms.json")).unwrap()).unwrap();
+    let mesh = read_mesh(fixture("room.ply"), &MeshOptions::default()).unwrap().mesh;
+    assert!(golden.free.is_empty());
+    let closed = SdfGrid::build(&mesh, &options(golden.voxel, 0.2, Some(0.0))).unwrap();
+    assert!(closed.dims == golden.dims && (closed.lowest - golden.lowest).length() < 1e-5);
+    // With a sheet far below the room not all surfaces are closed, which is another way to the same signs.
+    let mut open = mesh.clone();
+    open.add_quad(0, 0, [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)].map(|(x, y)| Vec3::new(x, y, -9.0)));
+    let open = SdfGrid::sample(&open, &options(golden.voxel, 0.2, Some(0.0)), closed.lowest, closed.dims).unwrap();
+    for grid in [closed, open] {
+        for (&i, &want) in golden.numbers.iter().zip(&golden.values) {
+            let (got, p) = (grid.values[i], grid.centre(grid.voxel_of(i)));
+            assert!((got - want).abs() < 1e-5, "{p}: {got}, expected {want}");
+        }
+    }
+    assert!(golden.values.iter().filter(|v| **v < 0.0).count() > 40);
+}
+
+#[test]
+fn top_cuts_off_what_is_above_it() {
+    let whole = SdfGrid::build(&room(), &options(0.1, 0.2, Some(0.0))).unwrap();
+    let low = SdfGrid::build(&room(), &SdfOptions { top: Some(1.8), ..options(0.1, 0.2, Some(0.0)) }).unwrap();
+    // From -0.2 to 1.8 m of -0.2 to 2.7 m.
+    assert_eq!((whole.dims[2], low.dims[2]), (30, 21));
+    assert!(each(&low).zip(whole.values.chunks(30).flat_map(|row| &row[..21])).all(|((_, a), b)| a == *b));
+    let e = SdfGrid::build(&room(), &SdfOptions { top: Some(-1.0), ..SdfOptions::default() }).unwrap_err().to_string();
+    assert!(e.contains("top = -1"), "{e}");
 }
 
 /// Distance to the open undersides of open.ply: a rectangle of 1 x 0.8 m and a disc of radius 0.4 m at height -0.3.

@@ -102,25 +102,61 @@ impl Tree {
 
     /// Square of the distance from `p` to the nearest triangle, or `bound` if that is less. `open` is scratch memory.
     pub fn distance_squared(&self, p: Vec3, bound: f32, open: &mut Vec<(f32, u32)>) -> f32 {
-        let mut best = bound;
+        self.search(p, (bound, 0), open).0
+    }
+
+    /// The nearest triangle and the square of its distance from `p`. The search is shorter if `guess` is near.
+    pub fn nearest(&self, p: Vec3, guess: u32, open: &mut Vec<(f32, u32)>) -> (f32, u32) {
+        self.search(p, ((nearest(p, self.triangle(guess)) - p).length_squared(), guess), open)
+    }
+
+    /// What is nearer than `best`, a square of a distance and a triangle, or that.
+    fn search(&self, p: Vec3, mut best: (f32, u32), open: &mut Vec<(f32, u32)>) -> (f32, u32) {
         open.clear();
         open.push((self.nodes[0].distance_squared(p), 0));
         while let Some((distance, i)) = open.pop() {
-            if distance >= best {
+            if distance >= best.0 {
                 continue;
             }
             let node = &self.nodes[i as usize];
             if node.count > 0 {
-                best = self.triangles[leaf(node)].iter().fold(best, |best, t| best.min((nearest(p, t) - p).length_squared()));
+                let squares = leaf(node).map(|t| ((nearest(p, &self.triangles[t]) - p).length_squared(), t as u32));
+                best = squares.fold(best, |best, t| if t.0 < best.0 { t } else { best });
                 continue;
             }
             let mut children = [node.first, node.first + 1].map(|c| (self.nodes[c as usize].distance_squared(p), c));
             if children[0].0 < children[1].0 {
                 children.swap(0, 1);
             }
-            open.extend(children.iter().filter(|c| c.0 < best));
+            open.extend(children.iter().filter(|c| c.0 < best.0));
         }
         best
+    }
+
+    /// Adds the triangles of all leaves that come as near to the box `low..high` as `reach` to `out`; false where these would be more than
+    /// `most`.
+    pub fn within(&self, low: Vec3, high: Vec3, reach: f32, most: usize, out: &mut Vec<u32>) -> bool {
+        let mut open = vec![0];
+        while let Some(i) = open.pop() {
+            let node = &self.nodes[i as usize];
+            if (node.low - high).max(low - node.high).max(Vec3::ZERO).length_squared() > reach * reach {
+                continue;
+            }
+            if node.count > 0 {
+                out.extend(leaf(node).map(|t| t as u32));
+            } else {
+                open.extend([node.first, node.first + 1]);
+            }
+            if out.len() > most {
+                return false;
+            }
+        }
+        true
+    }
+
+    /// One of the triangles.
+    pub fn triangle(&self, i: u32) -> &Tri {
+        &self.triangles[i as usize]
     }
 
     /// The generalised winding number at `p`: 1 within a closed surface whose normals point outwards, 0 outside, between them near holes.
@@ -153,7 +189,7 @@ fn leaf(node: &Node) -> std::ops::Range<usize> {
 }
 
 /// The point of a triangle nearest to `p` (Ericson, Real-Time Collision Detection, 5.1.5).
-fn nearest(p: Vec3, &Tri([a, b, c]): &Tri) -> Vec3 {
+pub(super) fn nearest(p: Vec3, &Tri([a, b, c]): &Tri) -> Vec3 {
     let (ab, ac, ap, bp, cp) = (b - a, c - a, p - a, p - b, p - c);
     let (d1, d2, d3, d4, d5, d6) = (ab.dot(ap), ac.dot(ap), ab.dot(bp), ac.dot(bp), ab.dot(cp), ac.dot(cp));
     if d1 <= 0.0 && d2 <= 0.0 {

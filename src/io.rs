@@ -46,6 +46,66 @@ pub fn sync_folder(dir: &Path) -> std::io::Result<()> {
     fs::File::open(dir)?.sync_all()
 }
 
+/// The name beside the folder `dir` that a folder has while it is written (`tmp`), or while another takes its place (`old.tmp`).
+fn beside(dir: &Path, suffix: &str) -> Result<PathBuf> {
+    let name = dir.file_name().ok_or_else(|| Error::file(dir, "is not a folder's name"))?.to_string_lossy();
+    Ok(dir.with_file_name(format!(".{name}.{suffix}")))
+}
+
+/// Removes a folder with all that it holds, if it is there.
+pub fn clear_folder(dir: &Path) -> Result<()> {
+    match fs::remove_dir_all(dir) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(dir, e)),
+        _ => Ok(()),
+    }
+}
+
+/// Removes the folder `dir` in one step, if it is there, so that a kill leaves it whole or not at all.
+pub fn discard_folder(dir: &Path) -> Result<()> {
+    let aside = beside(dir, "old.tmp")?;
+    clear_folder(&aside)?;
+    match fs::rename(dir, &aside) {
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(()),
+        Err(e) => Err(Error::io(dir, e)),
+        Ok(()) => clear_folder(&aside),
+    }
+}
+
+/// Puts a new folder with what `fill` writes into it in the place of `dir`. Where that fails `dir` is as it was, and nothing else is left;
+/// after a kill it is as it was, new, or, between two renames, where [`kept_folder`] finds it.
+pub fn replace_folder<E: From<Error>>(dir: &Path, fill: impl FnOnce(&Path) -> std::result::Result<(), E>) -> std::result::Result<(), E> {
+    let (fresh, old) = (beside(dir, "tmp")?, beside(dir, "old.tmp")?);
+    if kept_folder(dir)? == old {
+        fs::rename(&old, dir).map_err(|e| Error::io(&old, e))?;
+    }
+    clear_folder(&fresh)?;
+    clear_folder(&old)?;
+    let swap = || -> Result<()> {
+        let kept = dir.exists();
+        if kept {
+            fs::rename(dir, &old).map_err(|e| Error::io(dir, e))?;
+        }
+        fs::rename(&fresh, dir).map_err(|e| {
+            if kept {
+                let _ = fs::rename(&old, dir);
+            }
+            Error::io(dir, e)
+        })?;
+        sync_folder(dir.parent().unwrap_or(Path::new(""))).map_err(|e| Error::io(dir, e))
+    };
+    fill(&fresh).and_then(|()| Ok(swap()?)).inspect_err(|_| drop(fs::remove_dir_all(&fresh)))?;
+    Ok(clear_folder(&old)?)
+}
+
+/// Where the content of the folder `dir` is: there, or under another name where a kill interrupted [`replace_folder`].
+pub fn kept_folder(dir: &Path) -> Result<PathBuf> {
+    if dir.exists() {
+        return Ok(dir.to_path_buf());
+    }
+    let old = beside(dir, "old.tmp")?;
+    Ok(if old.exists() { old } else { dir.to_path_buf() })
+}
+
 /// SHA-256 of `bytes` in lower-case hexadecimal; how derived files name what they come from.
 pub fn content_hash(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
@@ -199,4 +259,58 @@ pub(crate) fn pack_raw(tensors: &[RawTensor], metadata: &BTreeMap<String, String
     // The header's map is written in one order only when it holds one entry, so all metadata travels as one JSON text.
     let info = (!metadata.is_empty()).then(|| [("egogen".to_string(), serde_json::json!(metadata).to_string())].into_iter().collect());
     safetensors::serialize(views, info).map_err(|e| Error::invalid(format!("cannot pack tensors: {e}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Names in a folder, sorted.
+    fn names(dir: &Path) -> Vec<String> {
+        let mut names: Vec<_> = fs::read_dir(dir).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    fn writes(text: &'static str) -> impl Fn(&Path) -> Result<()> {
+        move |dir| write_atomic(dir.join("a.txt"), text.as_bytes())
+    }
+
+    #[test]
+    fn folders_are_replaced_as_a_whole_or_not_at_all() {
+        let root = tempfile::tempdir().unwrap();
+        let dir = root.path().join("one");
+        let content = || fs::read_to_string(dir.join("a.txt")).unwrap();
+        replace_folder(&dir, writes("first")).unwrap();
+        fs::write(dir.join("b.txt"), "of the first").unwrap();
+        replace_folder(&dir, writes("second")).unwrap();
+        assert_eq!((content().as_str(), names(&dir), names(root.path())), ("second", vec!["a.txt".into()], vec!["one".into()]));
+        // The content cannot be written, or the new folder is gone when it is to be renamed.
+        let broken = |path: &Path| writes("third")(path).and(Err(Error::invalid("no more")));
+        assert!(replace_folder(&dir, broken).unwrap_err().to_string().contains("no more"));
+        assert_eq!((content().as_str(), names(root.path())), ("second", vec!["one".into()]));
+        assert!(replace_folder(&dir, |path| writes("third")(path).and_then(|()| clear_folder(path))).is_err());
+        assert_eq!((content().as_str(), names(root.path())), ("second", vec!["one".into()]));
+    }
+
+    #[test]
+    fn what_a_kill_leaves_is_found_and_put_back() {
+        let root = tempfile::tempdir().unwrap();
+        let (dir, old) = (root.path().join("one"), root.path().join(".one.old.tmp"));
+        assert_eq!((kept_folder(&dir).unwrap(), kept_folder(Path::new(".")).unwrap()), (dir.clone(), ".".into()));
+        writes("first")(&old).unwrap();
+        writes("half")(&root.path().join(".one.tmp")).unwrap();
+        assert_eq!(kept_folder(&dir).unwrap(), old);
+        // What fails before anything is renamed leaves the old content in its place.
+        replace_folder(&dir, |_| Err(Error::invalid("no more"))).unwrap_err();
+        assert_eq!((names(root.path()), fs::read_to_string(dir.join("a.txt")).unwrap()), (vec!["one".into()], "first".into()));
+        // A kill after both renames leaves what is old beside what is new.
+        writes("older")(&old).unwrap();
+        assert_eq!(kept_folder(&dir).unwrap(), dir);
+        replace_folder(&dir, writes("second")).unwrap();
+        assert_eq!(names(root.path()), ["one"]);
+        discard_folder(&dir).unwrap();
+        discard_folder(&dir).unwrap();
+        assert!(names(root.path()).is_empty());
+    }
 }

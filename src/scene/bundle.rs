@@ -2,7 +2,7 @@
 
 use super::outline::check_simple;
 use super::{Grid, Material, Pair, Polygon, SdfGrid, TriMesh};
-use crate::io::{RawTensor, Tensors, content_hash, pack_raw, sync_folder, write_atomic};
+use crate::io::{RawTensor, Tensors, content_hash, kept_folder, pack_raw, replace_folder, write_atomic};
 use crate::{Error, Result};
 use glam::{DVec2, Vec2, Vec3};
 use safetensors::Dtype;
@@ -84,26 +84,28 @@ struct Voxels {
 }
 
 impl SceneBundle {
-    /// Writes the folder `dir` with `picture`, the content of `top.png`, so that a reader sees the old folder or the whole new one.
+    /// Writes the folder `dir` with `picture`, the content of `top.png`, so that a reader finds the old bundle or the whole new one.
     ///
-    /// Errors: files, and a folder that holds something else than a scene.
+    /// Errors: files, and what [`SceneBundle::check_target`] refuses.
     pub fn write(&self, dir: &Path, picture: &[u8]) -> Result<()> {
-        let name = dir.file_name().ok_or_else(|| Error::file(dir, "is not a folder's name"))?.to_string_lossy().into_owned();
-        let mut entries = fs::read_dir(dir).into_iter().flatten();
-        if !dir.join(DESCRIPTION).exists() && (dir.is_file() || entries.next().is_some()) {
-            return Err(Error::file(dir, format!("is not empty and holds no {DESCRIPTION}; give a new folder")));
+        Self::check_target(dir)?;
+        replace_folder(dir, |fresh| self.write_files(fresh, picture))
+    }
+
+    /// Refuses a folder that a bundle must not take the place of: all but a new one, an empty one, and a bundle with nothing else in it.
+    pub fn check_target(dir: &Path) -> Result<()> {
+        let bad = |what: String| Err(Error::file(dir, format!("{what}; give a new folder")));
+        if dir.is_symlink() || dir.exists() && !dir.is_dir() {
+            return bad("is no folder".into());
         }
-        let hidden = |suffix: &str| dir.with_file_name(format!(".{name}.{suffix}"));
-        let (fresh, old) = (hidden("tmp"), hidden("old.tmp"));
-        let moved = clear(&fresh).and_then(|()| clear(&old)).and_then(|()| self.write_files(&fresh, picture)).and_then(|()| {
-            if dir.exists() {
-                fs::rename(dir, &old).map_err(|e| Error::io(dir, e))?;
-            }
-            fs::rename(&fresh, dir).map_err(|e| Error::io(dir, e))?;
-            sync_folder(dir.parent().unwrap_or(Path::new(""))).map_err(|e| Error::io(dir, e))
-        });
-        let cleared = clear(&old).and(clear(&fresh));
-        moved.and(cleared)
+        let names: Vec<_> = fs::read_dir(dir).into_iter().flatten().flatten().map(|e| e.file_name()).collect();
+        if let Some(name) = names.iter().find(|n| ![DESCRIPTION, TENSORS, PICTURE].iter().any(|own| n.as_os_str() == *own)) {
+            return bad(format!("holds {}, which is no part of a scene", Path::new(name).display()));
+        }
+        if !names.is_empty() && !names.iter().any(|n| n == DESCRIPTION) {
+            return bad(format!("is not empty and holds no {DESCRIPTION}"));
+        }
+        Ok(())
     }
 
     fn write_files(&self, dir: &Path, picture: &[u8]) -> Result<()> {
@@ -163,6 +165,7 @@ impl SceneBundle {
     ///
     /// Errors name the file and the entry: unknown or missing keys and tensors, other shapes, rings that cross themselves.
     pub fn read(dir: &Path) -> Result<Self> {
+        let dir = &kept_folder(dir)?;
         let path = dir.join(DESCRIPTION);
         let text = fs::read_to_string(&path).map_err(|e| Error::io(&path, e))?;
         let about: Description = serde_json::from_str(&text).map_err(|e| Error::file(&path, e.to_string()))?;
@@ -190,14 +193,6 @@ fn exact(ring: &[DVec2]) -> Vec<DVec2> {
 
 fn nanometres(p: DVec2) -> DVec2 {
     (p * 1e9).round() / 1e9
-}
-
-/// Removes a folder that may be there.
-fn clear(dir: &Path) -> Result<()> {
-    match fs::remove_dir_all(dir) {
-        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(Error::io(dir, e)),
-        _ => Ok(()),
-    }
 }
 
 /// The groups of tensors: each is there as a whole or not at all.
@@ -336,8 +331,27 @@ mod tests {
         let foreign = dir.path().join("foreign");
         fs::create_dir(&foreign).unwrap();
         fs::write(foreign.join("thesis.tex"), "much work").unwrap();
-        assert!(bare.write(&foreign, b"").unwrap_err().to_string().contains("holds no scene.json"));
-        assert!(foreign.join("thesis.tex").exists());
+        let refused = |dir: &Path| bare.write(dir, b"").unwrap_err().to_string();
+        assert!(refused(&foreign).contains("holds thesis.tex, which is no part of a scene"));
+        fs::write(path.join("notes.txt"), "of mine").unwrap();
+        assert!(refused(&path).contains("holds notes.txt"));
+        assert!(foreign.join("thesis.tex").exists() && path.join("notes.txt").exists() && SceneBundle::read(&path).is_ok());
+        assert!(refused(&path.join("notes.txt")).contains("is no folder"));
+        fs::rename(foreign.join("thesis.tex"), foreign.join(PICTURE)).unwrap();
+        assert!(refused(&foreign).contains("holds no scene.json"));
+    }
+
+    #[test]
+    fn a_bundle_survives_a_kill_between_renames() {
+        let dir = tempfile::tempdir().unwrap();
+        let (path, aside) = (dir.path().join("scene"), dir.path().join(".scene.old.tmp"));
+        let bare = SceneBundle { mesh: None, blocked: None, sdf: None, pairs: Vec::new(), ..bundle() };
+        bare.write(&path, b"").unwrap();
+        let whole = SceneBundle::read(&path).unwrap();
+        fs::rename(&path, &aside).unwrap();
+        assert_eq!(SceneBundle::read(&path).unwrap(), whole);
+        bare.write(&path, b"new").unwrap();
+        assert!(path.join(PICTURE).exists() && !aside.exists());
     }
 
     #[test]

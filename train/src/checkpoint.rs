@@ -9,7 +9,7 @@ use crate::recipe::CheckpointConfig;
 use crate::stats::EpochStats;
 use crate::{AdamW, Error, Result, RewardScaling};
 use egogen::agent::{ActionSpace, ObsLayout, PolicyConfig, PolicySpec};
-use egogen::io::{Precision, Tensors, content_hash, pack_tensors, sync_folder, write_atomic};
+use egogen::io::{Precision, Tensors, clear_folder, content_hash, discard_folder, pack_tensors, replace_folder, write_atomic};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fs;
@@ -101,20 +101,9 @@ impl Checkpoint {
         }
     }
 
-    /// Writes the checkpoint below `root` under a temporary name and renames it; nothing stays behind where that fails.
+    /// Writes the checkpoint below `root`, whole or not at all.
     pub fn write(&self, root: &Path, spec: &PolicySpec) -> Result<()> {
-        let name = self.name();
-        let temporary = root.join(format!(".{name}.tmp"));
-        remove(&temporary)?;
-        let written = self.write_files(&temporary, spec).and_then(|()| {
-            discard(root, &name)?;
-            let last = root.join(&name);
-            fs::rename(&temporary, &last).and_then(|()| sync_folder(root)).map_err(|e| egogen::Error::io(&last, e).into())
-        });
-        if written.is_err() {
-            let _ = fs::remove_dir_all(&temporary);
-        }
-        written
+        replace_folder(&root.join(self.name()), |dir| self.write_files(dir, spec))
     }
 
     fn write_files(&self, dir: &Path, spec: &PolicySpec) -> Result<()> {
@@ -242,7 +231,7 @@ pub fn newest(root: &Path, mut accept: impl FnMut(&Checkpoint) -> Result<()>, mu
             Ok(checkpoint) => {
                 for (bad, why) in refused {
                     let aside = root.join(format!("refused-{bad}"));
-                    remove(&aside)?;
+                    clear_folder(&aside)?;
                     fs::rename(root.join(&bad), &aside).map_err(|e| egogen::Error::io(&aside, e))?;
                     warn(format!("{why}; the run continues from {name}, and {bad} is now refused-{bad}"));
                 }
@@ -265,7 +254,7 @@ pub fn prune(root: &Path, rule: &CheckpointConfig, best: Option<&Best>) -> Resul
     for name in &names[..old] {
         let every = rule.keep_every.is_some_and(|n| position(name).is_some_and(|(epoch, update)| epoch.is_multiple_of(n) && update == 0));
         if !every && best.is_none_or(|b| b.name != *name) {
-            discard(root, name)?;
+            discard_folder(&root.join(name))?;
         }
     }
     Ok(())
@@ -284,29 +273,12 @@ pub fn sweep(dir: &Path) -> Result<()> {
             continue;
         }
         if path.is_dir() {
-            remove(&path)?;
+            clear_folder(&path)?;
         } else {
             fs::remove_file(&path).map_err(|e| egogen::Error::io(&path, e))?;
         }
     }
     Ok(())
-}
-
-/// Removes a checkpoint in one step, so that a kill leaves it whole or not at all.
-fn discard(root: &Path, name: &str) -> Result<()> {
-    let (from, to) = (root.join(name), root.join(format!(".{name}.old.tmp")));
-    remove(&to)?;
-    match fs::rename(&from, &to) {
-        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(egogen::Error::io(&from, e).into()),
-        _ => remove(&to),
-    }
-}
-
-fn remove(dir: &Path) -> Result<()> {
-    match fs::remove_dir_all(dir) {
-        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(egogen::Error::io(dir, e).into()),
-        _ => Ok(()),
-    }
 }
 
 #[cfg(test)]

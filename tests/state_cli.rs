@@ -89,6 +89,20 @@ fn a_resumed_run_and_another_thread_count_give_the_same_bytes() {
     assert_same_run(&whole, &parts, "epoch-0004");
 }
 
+/// The motion task with the network of `quick`, which learns on all threads.
+#[test]
+fn people_learn_the_same_bytes_on_any_number_of_threads() {
+    let dir = tempfile::tempdir().unwrap();
+    let small = ["run.epochs=2", "run.envs=24", "run.collect_steps=96", "run.epoch_steps=192", "ppo.batch=48"];
+    let recipe = [&["quick"], &small[..], &["test.episodes=4", "test.every=1", "checkpoint.every=1"]].concat();
+    let [one, two] = ["1", "2"].map(|threads| {
+        let out = dir.path().join(threads);
+        succeed(&[args(&recipe, &out), vec!["--threads", threads]].concat());
+        out
+    });
+    assert_same_run(&one, &two, "epoch-0002");
+}
+
 #[test]
 fn a_killed_run_resumes_with_everything_that_has_state() {
     let dir = tempfile::tempdir().unwrap();

@@ -11,6 +11,7 @@ use crate::{Error, Result};
 use clap::Parser;
 use egogen::agent::ActionSpace;
 use egogen::agent::bundle::Bundle;
+use egogen::kernels::keep_memory;
 use std::fs::DirEntry;
 use std::num::NonZeroU64;
 use std::path::{Path, PathBuf};
@@ -93,6 +94,7 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
     };
     recipe.seed = args.seed.unwrap_or(recipe.seed);
     let plan = recipe.plan()?;
+    keep_memory();
     // Before anything computes, and reading a bundle does.
     let threads = start_threads(args.threads)?;
     let init = args.init.as_deref().map(Bundle::read).transpose().given()?;

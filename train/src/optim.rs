@@ -79,7 +79,14 @@ impl AdamW {
 
 /// Euclidean norm of all gradients together.
 pub fn global_norm(grads: &[f32]) -> f32 {
-    let square = |chunk: &[f32]| chunk.iter().map(|&g| f64::from(g) * f64::from(g)).sum::<f64>();
+    // Several sums side by side: one alone would wait for each addition.
+    let square = |chunk: &[f32]| {
+        let mut sums = [0.0f64; 16];
+        for part in chunk.chunks(sums.len()) {
+            sums.iter_mut().zip(part).for_each(|(s, &g)| *s += f64::from(g) * f64::from(g));
+        }
+        sums.iter().sum::<f64>()
+    };
     let parts: Vec<f64> = grads.par_chunks(CHUNK).map(square).collect();
     parts.iter().sum::<f64>().sqrt() as f32
 }

@@ -155,13 +155,15 @@ pub struct Learner {
     params: Vec<f32>,
     adam: AdamW,
     progress: Progress,
+    /// Gradients of the last minibatch.
+    grads: Vec<f32>,
 }
 
 impl Learner {
     /// A learner that goes on from `params`, the moments `adam` and `progress`.
     pub fn new(spec: PolicySpec, compute: Compute, shards: Shards, params: Vec<f32>, adam: AdamW, progress: Progress) -> Result<Self> {
         let policy = Policy::new(&spec, &params, &compute)?;
-        Ok(Self { spec, compute, shards, policy, params, adam, progress })
+        Ok(Self { spec, compute, shards, policy, params, adam, progress, grads: vec![] })
     }
 
     /// The policy as it is now.
@@ -209,7 +211,7 @@ impl Learner {
             order.shuffle(&mut rng);
             for chosen in order.chunks(ppo.batch) {
                 let batch = Batch::gather(rollout, &targets, chosen);
-                let (grads, losses, ratio_error) = self.gradients(&batch, ppo)?;
+                let (losses, ratio_error) = self.gradients(&batch, ppo)?;
                 if steps == 0 {
                     stats.first_ratio_error = ratio_error;
                 } else if ppo.target_kl.is_some_and(|kl| losses.approx_kl > 1.5 * f64::from(kl)) {
@@ -219,7 +221,7 @@ impl Learner {
                 }
                 stats.losses.add(&losses, 1.0 / batches as f64);
                 let (learned, scale) = (self.spec.learned(), clip_scale(losses.grad_norm as f32, ppo.max_grad_norm));
-                self.adam.step(&AdamConfig { lr, ..*rules.adam }, &mut self.params[..learned], &grads[..learned], scale);
+                self.adam.step(&AdamConfig { lr, ..*rules.adam }, &mut self.params[..learned], &self.grads[..learned], scale);
                 steps += 1;
             }
         }
@@ -285,17 +287,18 @@ impl Learner {
         Ok(self.targets(rollout, value, &next_value, rules))
     }
 
-    /// Gradients and losses of a minibatch, all finite, and the largest |ratio - 1|.
-    fn gradients(&self, batch: &Batch, ppo: &PpoConfig) -> Result<(Vec<f32>, Losses, f64)> {
-        let (grads, mut losses, ratio_error) = gradients(&self.spec, &self.params, &self.compute, &self.shards, batch, ppo)?;
-        losses.grad_norm = f64::from(global_norm(&grads));
+    /// Losses of a minibatch, all finite like the gradients that are kept, and the largest |ratio - 1|.
+    fn gradients(&mut self, batch: &Batch, ppo: &PpoConfig) -> Result<(Losses, f64)> {
+        let computing = (&self.compute, &self.shards);
+        let (mut losses, ratio_error) = gradients(&self.spec, &self.params, computing, batch, ppo, &mut self.grads)?;
+        losses.grad_norm = f64::from(global_norm(&self.grads));
         match losses.named().iter().find(|(_, v)| !v.is_finite()) {
             Some((name, value)) => Err(Error::run(format!(
                 "{name} became {value} in update {}, before it reached the weights. A lower learning rate (adam.lr) or a tighter \
                  ppo.max_grad_norm may help",
                 self.progress.updates + 1
             ))),
-            None => Ok((grads, losses, ratio_error)),
+            None => Ok((losses, ratio_error)),
         }
     }
 }

@@ -20,17 +20,21 @@ impl Shards {
         Ok(Self { pools: (0..count).map(pool).collect::<Result<_>>()?, parallel: threads > 1 })
     }
 
+    /// Every shard's part of `rows` rows.
+    pub fn ranges(&self, rows: usize) -> impl Iterator<Item = Range<usize>> + use<> {
+        let count = self.pools.len();
+        (0..count).map(move |i| i * rows / count..(i + 1) * rows / count)
+    }
+
     /// Runs `work` on every shard's part of `rows` rows; results in the order of the shards.
     pub fn map<T: Send>(&self, rows: usize, work: impl Fn(Range<usize>) -> T + Sync) -> Vec<T> {
-        let count = self.pools.len();
-        let part = |i: usize| i * rows / count..(i + 1) * rows / count;
-        let work = &work;
+        let (work, parts) = (&work, self.pools.iter().zip(self.ranges(rows)));
         if !self.parallel {
-            return self.pools.iter().enumerate().map(|(i, pool)| pool.install(|| work(part(i)))).collect();
+            return parts.map(|(pool, part)| pool.install(|| work(part))).collect();
         }
         std::thread::scope(|scope| {
-            let start = |(i, pool)| scope.spawn(move || ThreadPool::install(pool, || work(part(i))));
-            let running: Vec<_> = self.pools.iter().enumerate().map(start).collect();
+            let start = |(pool, part)| scope.spawn(move || ThreadPool::install(pool, || work(part)));
+            let running: Vec<_> = parts.map(start).collect();
             running.into_iter().map(|t| t.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
         })
     }

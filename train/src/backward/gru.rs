@@ -1,8 +1,7 @@
 //! The GRU over a sequence group and its backward pass through time.
 
-use super::{dense, dense_grad, parts_mut, rows_of, weight};
-use crate::primitives::layers::add_rows;
-use egogen::agent::{Dense, Encoder, Part, PolicySpec};
+use super::{Delta, dense, rows_of, weight};
+use egogen::agent::{Encoder, Part, PolicySpec};
 use egogen::kernels::{Activation, product};
 
 /// A GRU run from the zero state: r, z = s(x W + b + h U + c), n = tanh(x W + b + r (h U + c)), h' = n + z (h - n).
@@ -52,8 +51,8 @@ impl Gru {
         self.states[self.states.len() - self.rows * self.hidden..].chunks_exact(self.hidden)
     }
 
-    /// Adds to `grad` from `d`, the gradient of the last state.
-    pub fn backward(&self, ih: &Dense, hh: &Dense, flat: &[f32], mut d: Vec<f32>, grad: &mut [f32]) {
+    /// What the layers `ih` and `hh` learn from `d`, the gradient of the last state.
+    pub fn backward(mut self, spec: &PolicySpec, flat: &[f32], [ih, hh]: [usize; 2], mut d: Vec<f32>) -> [Delta; 2] {
         let (h, n) = (self.hidden, self.rows * self.hidden);
         let mut input = vec![0.0; self.gates.len() / 4 * 3];
         let mut share = input.clone();
@@ -65,15 +64,12 @@ impl Gru {
                 step_back(gates, before.get(i * h..(i + 1) * h), d, input, share);
             }
             if t > 0 {
-                product(rows_of(&share[t * 3 * n..(t + 1) * 3 * n], 3 * h), weight(hh, flat), &mut d, h, true);
+                product(rows_of(&share[t * 3 * n..(t + 1) * 3 * n], 3 * h), weight(&spec.layers[hh], flat), &mut d, h, true);
             }
         }
-        dense_grad(ih, &input, &self.x, grad);
         // Only later frames have a state before them; the bias acts in all.
-        let (weight, bias) = parts_mut(hh, grad);
-        let later = &share[3 * n..];
-        product(rows_of(later, 3 * h).t(), rows_of(&self.states[..later.len() / 3], h), weight, h, true);
-        add_rows(&share, bias);
+        self.states.truncate(self.states.len() - n);
+        [Delta { layer: ih, x: self.x, dy: input }, Delta { layer: hh, x: self.states, dy: share }]
     }
 }
 

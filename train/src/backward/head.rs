@@ -1,6 +1,6 @@
 //! Actor and critic behind the encodings, forwards and backwards.
 
-use super::{dense, dense_back, dense_grad, rows_of, weight};
+use super::{Delta, dense, dense_back, rows_of, weight};
 use egogen::agent::{Nonlinearity, PolicySpec, SLOPE};
 use egogen::kernels::{Activation, product};
 
@@ -26,17 +26,18 @@ impl Chain {
         (Self { inputs }, h)
     }
 
-    /// From the gradient of the last layer's activations `out` to that of the first one's input.
-    pub fn backward(&self, spec: &PolicySpec, flat: &[f32], layers: &[usize], out: &[f32], mut d: Vec<f32>, grad: &mut [f32]) -> Vec<f32> {
-        for (i, &layer) in layers.iter().enumerate().rev() {
-            let layer = &spec.layers[layer];
-            let y = self.inputs.get(i + 1).map_or(out, Vec::as_slice);
+    /// From the gradient of the last layer's activations `y` to that of the first one's input.
+    pub fn backward(self, spec: &PolicySpec, flat: &[f32], layers: &[usize], y: &[f32], mut d: Vec<f32>, out: &mut Vec<Delta>) -> Vec<f32> {
+        let last = out.len();
+        for (&layer, x) in layers.iter().zip(self.inputs).rev() {
+            // What a layer said is what the next one saw.
+            let y = out[last..].last().map_or(y, |next| &next.x);
             match spec.config.activation {
                 Nonlinearity::Tanh => d.iter_mut().zip(y).for_each(|(d, y)| *d *= 1.0 - y * y),
                 Nonlinearity::Relu => d.iter_mut().zip(y).for_each(|(d, &y)| *d = if y > 0.0 { *d } else { 0.0 }),
             }
-            dense_grad(layer, &d, &self.inputs[i], grad);
-            d = dense_back(layer, flat, &d);
+            let before = dense_back(&spec.layers[layer], flat, &d);
+            out.push(Delta { layer, x, dy: std::mem::replace(&mut d, before) });
         }
         d
     }
@@ -76,25 +77,25 @@ impl Head {
     }
 
     /// From the gradient of the output to that of the trunk.
-    pub fn backward(&self, spec: &PolicySpec, flat: &[f32], layers: &[usize], d: Vec<f32>, grad: &mut [f32]) -> Vec<f32> {
+    pub fn backward(mut self, spec: &PolicySpec, flat: &[f32], layers: &[usize], dy: Vec<f32>, out: &mut Vec<Delta>) -> Vec<f32> {
         let (blocks, last) = layers.split_at(layers.len() - 1);
-        let last = &spec.layers[last[0]];
-        dense_grad(last, &d, &self.inputs[self.inputs.len() - 1], grad);
-        let mut d = dense_back(last, flat, &d);
-        for ((pair, h), [first, second]) in blocks.chunks_exact(2).zip(&self.inputs).zip(&self.inner).rev() {
+        let x = self.inputs.split_off(self.inner.len()).remove(0);
+        let mut d = dense_back(&spec.layers[last[0]], flat, &dy);
+        if !spec.config.hidden.is_empty() {
+            d = self.plain.backward(spec, flat, blocks, &x, d, out);
+        }
+        out.push(Delta { layer: last[0], x, dy });
+        for ((pair, h), [first, second]) in blocks.chunks_exact(2).zip(self.inputs).zip(self.inner).rev() {
             let (a, b) = (&spec.layers[pair[0]], &spec.layers[pair[1]]);
             let mut inner = d.clone();
-            leaky_back(second, &mut inner);
-            dense_grad(b, &inner, first, grad);
-            inner = dense_back(b, flat, &inner);
-            leaky_back(first, &mut inner);
-            dense_grad(a, &inner, h, grad);
-            product(rows_of(&inner, a.output), weight(a, flat), &mut d, a.input, true);
+            leaky_back(&second, &mut inner);
+            let mut outer = dense_back(b, flat, &inner);
+            leaky_back(&first, &mut outer);
+            product(rows_of(&outer, a.output), weight(a, flat), &mut d, a.input, true);
+            out.push(Delta { layer: pair[1], x: first, dy: inner });
+            out.push(Delta { layer: pair[0], x: h, dy: outer });
         }
-        match spec.config.hidden.is_empty() {
-            true => d,
-            false => self.plain.backward(spec, flat, blocks, &self.inputs[0], d, grad),
-        }
+        d
     }
 }
 

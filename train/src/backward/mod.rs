@@ -4,11 +4,17 @@
 mod gru;
 mod head;
 
-use crate::primitives::layers::{add_rows, fill_rows};
+use crate::primitives::layers::fill_rows;
 use egogen::agent::{Dense, Encoder, Part, PolicySpec};
 use egogen::kernels::{Mat, product};
 use gru::Gru;
 use head::{Chain, Head};
+use rayon::prelude::*;
+
+/// Outputs of a layer whose weights one thread works on at a time.
+const OUTPUTS: usize = 192;
+/// Products smaller than this, multiplications, are not worth a second thread.
+const SMALL: usize = 1 << 21;
 
 /// What the network said of some observations, and all that its backward pass needs.
 pub struct Tape<'a> {
@@ -67,28 +73,76 @@ impl<'a> Tape<'a> {
         &self.critic.out
     }
 
-    /// Gradients of all parameters, in the flat layout, from those of [`Tape::action`] and [`Tape::value`].
-    pub fn backward(&self, action: Vec<f32>, value: Vec<f32>) -> Vec<f32> {
-        let (spec, flat) = (self.spec, self.flat);
-        let mut grad = vec![0.0; spec.params()];
-        let mut d = self.actor.backward(spec, flat, &spec.actor, action, &mut grad);
-        let critic = self.critic.backward(spec, flat, &spec.critic, value, &mut grad);
+    /// What every layer learns from gradients of [`Tape::action`] and [`Tape::value`].
+    pub fn backward(self, action: Vec<f32>, value: Vec<f32>) -> Vec<Delta> {
+        let (spec, flat, mut out) = (self.spec, self.flat, vec![]);
+        let mut d = self.actor.backward(spec, flat, &spec.actor, action, &mut out);
+        let critic = self.critic.backward(spec, flat, &spec.critic, value, &mut out);
         d.iter_mut().zip(critic).for_each(|(a, c)| *a += c);
-        d = self.shared.backward(spec, flat, &spec.shared, &self.trunk, d, &mut grad);
-        if let Some(i) = spec.project {
-            dense_grad(&spec.layers[i], &d, &self.encoded, &mut grad);
-            d = dense_back(&spec.layers[i], flat, &d);
+        d = self.shared.backward(spec, flat, &spec.shared, &self.trunk, d, &mut out);
+        if let Some(layer) = spec.project {
+            let before = dense_back(&spec.layers[layer], flat, &d);
+            out.push(Delta { layer, x: self.encoded, dy: std::mem::replace(&mut d, before) });
         }
         let mut at = 0;
-        for (encoder, gru) in spec.encoders.iter().zip(&self.grus) {
+        for (encoder, gru) in spec.encoders.iter().zip(self.grus) {
             if let (Some(gru), Part::Gru { ih, hh, .. }) = (gru, &encoder.part) {
                 let columns = d.chunks_exact(spec.encoded()).flat_map(|row| &row[at..at + encoder.output]);
-                gru.backward(&spec.layers[*ih], &spec.layers[*hh], flat, columns.copied().collect(), &mut grad);
+                out.extend(gru.backward(spec, flat, [*ih, *hh], columns.copied().collect()));
             }
             at += encoder.output;
         }
-        grad
+        out
     }
+}
+
+/// What a layer learns from.
+pub struct Delta {
+    layer: usize,
+    /// rows x input: what it saw.
+    x: Vec<f32>,
+    /// rows x output: the gradient of what it said. Rows before those of `x` saw zeros.
+    dy: Vec<f32>,
+}
+
+/// Writes the gradients of all layers' weights and biases to `grads`, in the flat layout: the sums over `parts`, pieces of one batch.
+///
+/// Every number is summed by one thread over the parts in their order.
+pub fn weigh(spec: &PolicySpec, parts: &[Vec<Delta>], grads: &mut [f32]) {
+    let (mut pieces, mut rest, mut at) = (vec![], grads, 0);
+    for (i, layer) in spec.layers.iter().enumerate() {
+        let (own, behind) = rest[layer.offset - at..].split_at_mut(layer.params());
+        (rest, at) = (behind, layer.offset + layer.params());
+        let (weight, bias) = own.split_at_mut(layer.output * layer.input);
+        let chunks = weight.chunks_mut(OUTPUTS * layer.input).zip(bias.chunks_mut(OUTPUTS));
+        pieces.extend(chunks.enumerate().map(|(k, (weight, bias))| (i, k * OUTPUTS, weight, bias)));
+    }
+    let work = |(i, first, weight, bias): (usize, usize, &mut [f32], &mut [f32])| {
+        let (layer, seen) = (&spec.layers[i], parts.iter().flatten().filter(|d| d.layer == i));
+        bias.fill(0.0);
+        for (k, delta) in seen.enumerate() {
+            weigh_piece(layer, first, delta, weight, k > 0);
+            for row in delta.dy.chunks_exact(layer.output) {
+                bias.iter_mut().zip(&row[first..]).for_each(|(b, d)| *b += d);
+            }
+        }
+    };
+    let rows: usize = parts.iter().flat_map(|p| p.first()).map(|d| d.dy.len() / spec.layers[d.layer].output).sum();
+    match rows * spec.params() < SMALL {
+        true => pieces.into_iter().for_each(work),
+        false => pieces.into_par_iter().for_each(work),
+    }
+}
+
+/// dW = dy^T x, or dW += dy^T x if `add`, for some outputs from `first` on.
+fn weigh_piece(layer: &Dense, first: usize, delta: &Delta, weight: &mut [f32], add: bool) {
+    let rows = delta.x.len() / layer.input;
+    if rows == 0 {
+        return weight.iter_mut().for_each(|w| *w = if add { *w } else { 0.0 });
+    }
+    let dy = &delta.dy[delta.dy.len() - rows * layer.output..];
+    let dy = Mat::strided(&dy[first..], rows, weight.len() / layer.input, layer.output);
+    product(dy.t(), rows_of(&delta.x, layer.input), weight, layer.input, add);
 }
 
 /// One person's encoding; `state` is the GRU's last, `obs` starts at the group.
@@ -112,11 +166,6 @@ fn weight<'a>(layer: &Dense, flat: &'a [f32]) -> Mat<'a> {
     Mat::new(layer.weight_of(flat), layer.output, layer.input)
 }
 
-/// Weight and bias of a layer within the flat vector.
-fn parts_mut<'a>(layer: &Dense, flat: &'a mut [f32]) -> (&'a mut [f32], &'a mut [f32]) {
-    flat[layer.offset..layer.offset + layer.params()].split_at_mut(layer.output * layer.input)
-}
-
 /// y = x W^T + b.
 fn dense(layer: &Dense, flat: &[f32], x: &[f32]) -> Vec<f32> {
     let mut y = vec![0.0; x.len() / layer.input * layer.output];
@@ -130,11 +179,4 @@ fn dense_back(layer: &Dense, flat: &[f32], dy: &[f32]) -> Vec<f32> {
     let mut dx = vec![0.0; dy.len() / layer.output * layer.input];
     product(rows_of(dy, layer.output), weight(layer, flat), &mut dx, layer.input, false);
     dx
-}
-
-/// dW = dy^T x, db = the sum of dy over rows.
-fn dense_grad(layer: &Dense, dy: &[f32], x: &[f32], grad: &mut [f32]) {
-    let (weight, bias) = parts_mut(layer, grad);
-    product(rows_of(dy, layer.output).t(), rows_of(x, layer.input), weight, layer.input, false);
-    add_rows(dy, bias);
 }

@@ -72,36 +72,39 @@ impl Losses {
     }
 }
 
-/// Gradients of the loss over all parameters, mean losses, and the largest |ratio - 1|.
+/// Mean losses, and the largest |ratio - 1|. `grads` becomes the gradients over all parameters; what it holds before does not matter, but
+/// its memory is used again.
 pub fn gradients(
     spec: &PolicySpec,
     params: &[f32],
-    compute: &Compute,
-    shards: &Shards,
+    (compute, shards): (&Compute, &Shards),
     batch: &Batch,
     ppo: &PpoConfig,
-) -> Result<(Vec<f32>, Losses, f64)> {
+    grads: &mut Vec<f32>,
+) -> Result<(Losses, f64)> {
     let normalised = ppo.advantage_normalization.then(|| Batch { advantage: normalise(&batch.advantage), ..batch.clone() });
     let batch = normalised.as_ref().unwrap_or(batch);
-    let parts = match compute {
-        Compute::Own => shards.map(batch.returns.len(), |rows| Ok(own::shard(spec, params, batch, rows, ppo))),
-        Compute::Burn(device) => {
-            let network = Network::new(spec, params, device);
-            shards.map(batch.returns.len(), |rows| autodiff::shard(&network, batch, rows, ppo))
+    let rows = batch.returns.len();
+    let device = match compute {
+        Compute::Own => {
+            // Every layer is written anew; what no gradient moves stays 0.
+            grads.resize(spec.params(), 0.0);
+            grads[spec.obs_norm_range()].fill(0.0);
+            return Ok(own::learn(spec, params, batch, shards.ranges(rows).collect(), ppo, grads));
         }
+        Compute::Burn(device) => device,
     };
+    let network = Network::new(spec, params, device);
     let (mut losses, mut ratio_error) = (Losses::default(), 0.0f64);
-    let mut sum: Vec<f32> = vec![];
-    for part in parts {
-        let (grads, part, error) = part?;
+    grads.clear();
+    grads.resize(spec.params(), 0.0);
+    for part in shards.map(rows, |rows| autodiff::shard(&network, batch, rows, ppo)) {
+        let (part_grads, part, error) = part?;
         losses.add(&part, 1.0);
         ratio_error = ratio_error.max(error);
-        match sum.is_empty() {
-            true => sum = grads,
-            false => sum.par_iter_mut().with_min_len(1 << 14).zip(&grads).for_each(|(s, g)| *s += g),
-        }
+        grads.par_iter_mut().with_min_len(1 << 14).zip(&part_grads).for_each(|(s, g)| *s += g);
     }
-    Ok((sum, losses, ratio_error))
+    Ok((losses, ratio_error))
 }
 
 impl Batch {

@@ -2,14 +2,46 @@
 
 use super::{Batch, Losses};
 use crate::PpoConfig;
-use crate::backward::Tape;
+use crate::backward::{Delta, Tape, weigh};
 use crate::ppo::PriorForm;
 use egogen::agent::{ActionSpace, PolicySpec, log_prob_of, log_softmax_of, state_logvar};
+use rayon::prelude::*;
 use std::f64::consts::TAU;
 use std::ops::Range;
 
-/// One shard's share of the minibatch's loss, with gradients by hand.
-pub(super) fn shard(spec: &PolicySpec, params: &[f32], batch: &Batch, rows: Range<usize>, ppo: &PpoConfig) -> (Vec<f32>, Losses, f64) {
+/// What a shard leaves: what its layers learn from, the gradient of what the log standard deviations give, and its share of the figures.
+type Part = (Vec<Delta>, Vec<f32>, Losses, f64);
+
+/// The minibatch's loss with gradients by hand, which are written to `grads`. `shards` are ranges of its rows, each for one thread.
+pub(super) fn learn(
+    spec: &PolicySpec,
+    params: &[f32],
+    batch: &Batch,
+    shards: Vec<Range<usize>>,
+    ppo: &PpoConfig,
+    grads: &mut [f32],
+) -> (Losses, f64) {
+    let work = |rows| shard(spec, params, batch, rows, ppo);
+    let parts: Vec<Part> = match shards.len() {
+        // The way to another thread takes longer than a small network.
+        1 => shards.into_iter().map(work).collect(),
+        _ => shards.into_par_iter().map(work).collect(),
+    };
+    let (mut losses, mut ratio_error, mut deltas) = (Losses::default(), 0.0f64, vec![]);
+    let log_std = spec.log_std_range();
+    grads[log_std.clone()].fill(0.0);
+    for (delta, d_free, part, error) in parts {
+        losses.add(&part, 1.0);
+        ratio_error = ratio_error.max(error);
+        grads[log_std.clone()].iter_mut().zip(d_free).for_each(|(g, d)| *g += 2.0 * d);
+        deltas.push(delta);
+    }
+    weigh(spec, &deltas, grads);
+    (losses, ratio_error)
+}
+
+/// One shard's share.
+fn shard(spec: &PolicySpec, params: &[f32], batch: &Batch, rows: Range<usize>, ppo: &PpoConfig) -> Part {
     let (dim, width, outputs) = (spec.layout.dim(), spec.action.width(), spec.outputs());
     let count = batch.returns.len() as f32;
     let tape = Tape::forward(spec, params, &batch.obs[rows.start * dim..rows.end * dim]);
@@ -49,9 +81,7 @@ pub(super) fn shard(spec: &PolicySpec, params: &[f32], batch: &Batch, rows: Rang
         };
         ratio_error = ratio_error.max(beyond.abs());
     }
-    let mut grad = tape.backward(d_action, d_value);
-    grad[spec.log_std_range()].iter_mut().zip(d_free).for_each(|(g, d)| *g = 2.0 * d);
-    (grad, losses, ratio_error)
+    (tape.backward(d_action, d_value), d_free, losses, ratio_error)
 }
 
 /// The error that counts, and whether it moves with the value. With `value_clip` the value may leave the old one by at most the clip

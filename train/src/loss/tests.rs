@@ -54,6 +54,20 @@ fn ppo(changes: serde_json::Value) -> PpoConfig {
     serde_json::from_value(config).unwrap()
 }
 
+fn gradients(
+    spec: &PolicySpec,
+    params: &[f32],
+    compute: &Compute,
+    shards: &Shards,
+    batch: &Batch,
+    ppo: &PpoConfig,
+) -> Result<(Vec<f32>, Losses, f64)> {
+    // What the buffer held before must not matter.
+    let mut grads = vec![f32::NAN; spec.params()];
+    let (losses, ratio_error) = super::gradients(spec, params, (compute, shards), batch, ppo, &mut grads)?;
+    Ok((grads, losses, ratio_error))
+}
+
 fn assert_close(have: &[f32], want: &[f32], what: &str) {
     assert_eq!(have.len(), want.len());
     let scale = want.iter().fold(1.0f32, |m, x| m.max(x.abs()));

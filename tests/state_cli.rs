@@ -249,8 +249,8 @@ fn spoiled_checkpoints_are_refused_for_the_one_before() {
         (Box::new(folder(&gamma, "epoch-0003")), ["recipe.toml", "ppo.gamma is 0.9, expected 0.95"]),
         (Box::new(folder(&cartpole, "epoch-0003")), ["recipe.toml", "env is \"cartpole\", expected \"point\""]),
         (Box::new(folder(&wide, "epoch-0003")), ["recipe.toml", "policy.trunk is 24, expected 16"]),
-        (Box::new(edit("\"format\": 4", "\"format\": 5, \"more\": 1")), ["checkpoint.json", "format is 5, from a newer version"]),
-        (Box::new(edit("\"format\": 4", "\"format\": 1")), ["checkpoint.json", "format is 1, which can no longer be read"]),
+        (Box::new(edit("\"format\": 5", "\"format\": 6, \"more\": 1")), ["checkpoint.json", "format is 6, from a newer version"]),
+        (Box::new(edit("\"format\": 5", "\"format\": 1")), ["checkpoint.json", "format is 1, which can no longer be read"]),
         (Box::new(edit("\"epoch\": 3", "\"epoch\": 2")), ["checkpoint.json", "is of epoch 2, but state.bin is of epoch 3"]),
     ];
     for (i, (spoil, words)) in cases.iter().enumerate() {
@@ -265,23 +265,27 @@ fn spoiled_checkpoints_are_refused_for_the_one_before() {
     }
 }
 
-/// Format 3 ends before the scale of rewards: an empty list and three floats.
+/// Format 4 ends before the course: three empty or zero numbers, a missing one, and no end. Format 3 ends before the scale of rewards,
+/// too: an empty list and three floats.
 #[test]
-fn checkpoints_of_the_format_before_are_continued() {
+fn checkpoints_of_the_formats_before_are_continued() {
     let dir = tempfile::tempdir().unwrap();
     let whole = run(dir.path(), "whole", POINT, 2);
-    let parts = run(dir.path(), "parts", POINT, 1);
-    let checkpoint = parts.join("checkpoints/epoch-0001");
-    let mut state = read(&checkpoint, "state.bin");
-    let new = egogen::io::content_hash(&state);
-    state.truncate(state.len() - 25);
-    fs::write(checkpoint.join("state.bin"), &state).unwrap();
-    let description = String::from_utf8(read(&checkpoint, "checkpoint.json")).unwrap();
-    assert!(description.contains(&new));
-    let older = description.replace(&new, &egogen::io::content_hash(&state)).replace("\"format\": 4", "\"format\": 3");
-    fs::write(checkpoint.join("checkpoint.json"), older).unwrap();
-    succeed(&["--resume", text(&parts), "--set", "run.epochs=2"]);
-    assert_same_run(&whole, &parts, "epoch-0002");
+    for (format, bytes) in [(4, 5), (3, 5 + 25)] {
+        let parts = run(dir.path(), &format!("parts-{format}"), POINT, 1);
+        let checkpoint = parts.join("checkpoints/epoch-0001");
+        let mut state = read(&checkpoint, "state.bin");
+        let new = egogen::io::content_hash(&state);
+        state.truncate(state.len() - bytes);
+        fs::write(checkpoint.join("state.bin"), &state).unwrap();
+        let description = String::from_utf8(read(&checkpoint, "checkpoint.json")).unwrap();
+        assert!(description.contains(&new));
+        let format = format!("\"format\": {format}");
+        let older = description.replace(&new, &egogen::io::content_hash(&state)).replace("\"format\": 5", &format);
+        fs::write(checkpoint.join("checkpoint.json"), older).unwrap();
+        succeed(&["--resume", text(&parts), "--set", "run.epochs=2"]);
+        assert_same_run(&whole, &parts, "epoch-0002");
+    }
 }
 
 #[test]

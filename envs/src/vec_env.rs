@@ -1,6 +1,7 @@
 //! The contract between an environment and a trainer.
 
 pub use egogen::agent::{ActionSpace, ObsGroup};
+use std::any::Any;
 
 /// Shapes and names that stay fixed for the life of an environment.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -96,8 +97,8 @@ pub enum EnvError {
 /// n environments stepped together, with same-step auto-reset.
 ///
 /// Every environment has random streams of its own, so results depend on the seed and the actions only: not on n's other
-/// members' actions, not on the number of threads.
-pub trait VecEnv: Send {
+/// members' actions, not on the number of threads. What knows the kind can ask for it: `(env as &dyn Any).downcast_ref()`.
+pub trait VecEnv: Any + Send {
     /// Fixed shapes and names.
     fn spec(&self) -> &EnvSpec;
 

@@ -4,6 +4,7 @@
 //! `model.safetensors`, `optimizer.safetensors`, `state.bin` (environments, counters, sums of a begun epoch), `recipe.toml` and
 //! `checkpoint.json`, which describes the policy and carries the hashes of the other files.
 
+use crate::course::Course;
 use crate::ppo::Progress;
 use crate::recipe::CheckpointConfig;
 use crate::stats::EpochStats;
@@ -15,8 +16,9 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-const FORMAT: u32 = 4;
-/// Oldest format that is read: it has no `recipe.toml` and no [`State::last_epoch`]. No format below 4 has [`State::scaling`].
+const FORMAT: u32 = 5;
+/// Oldest format that is read: it has no `recipe.toml` and no [`State::last_epoch`]. No format below 4 has [`State::scaling`], none
+/// below 5 [`State::course`].
 const OLDEST: u32 = 2;
 pub(crate) const DESCRIPTION: &str = "checkpoint.json";
 const MODEL: &str = "model.safetensors";
@@ -80,6 +82,8 @@ pub struct State {
     pub last_epoch: BTreeMap<String, f64>,
     /// Scale of rewards.
     pub scaling: RewardScaling,
+    /// Curricula and convergence.
+    pub course: Course,
 }
 
 /// A whole checkpoint in memory.
@@ -145,9 +149,12 @@ impl Checkpoint {
             // postcard writes fields one after the other, and an empty map as one zero.
             state.push(0);
         }
-        if description.format < FORMAT {
-            let none = postcard::to_stdvec(&RewardScaling::default());
-            state.extend(none.map_err(|e| Error::run(format!("cannot read an older checkpoint: {e}")))?);
+        let old = |e| Error::run(format!("cannot read an older checkpoint: {e}"));
+        if description.format < 4 {
+            state.extend(postcard::to_stdvec(&RewardScaling::default()).map_err(old)?);
+        }
+        if description.format < 5 {
+            state.extend(postcard::to_stdvec(&Course::default()).map_err(old)?);
         }
         let state: State = postcard::from_bytes(&state).map_err(|e| egogen::Error::file(dir.join(STATE), e.to_string()))?;
         if (description.epoch, description.env_steps) != (state.epoch, state.env_steps) {

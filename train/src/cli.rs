@@ -2,13 +2,16 @@
 
 use crate::checkpoint::is_leftover;
 use crate::program::{self, Given, INTERRUPTED};
+use crate::job::Job;
 use crate::recipe::{EMBEDDED, Plan, Recipe, of_run};
 use crate::registry::{Purpose, Registry};
 use crate::seeds::Seeds;
+use crate::select::select;
+use crate::stages::Scheme;
 use crate::start::{initial, policy_spec};
-use crate::trainer::{Outcome, Trainer};
+use crate::trainer::{Outcome, Trainer, export};
 use crate::{Error, Result};
-use clap::Parser;
+use clap::{Parser, Subcommand};
 use egogen::agent::ActionSpace;
 use egogen::agent::bundle::Bundle;
 use egogen::kernels::keep_memory;
@@ -24,6 +27,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 #[command(
     name = "train",
     version,
+    args_conflicts_with_subcommands = true,
     after_help = "Examples:
   train                                   train the recipe `quick` into runs/quick
   train point --set run.epochs=4          a recipe with a changed value
@@ -32,10 +36,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
   train --resume runs/mine                continue bit for bit where it stopped
   train my.toml --init runs/mine/policy   start from the weights of a trained policy
   train paper --dry-run                   show what would be done, and how long it would take
+  train crowded --set stages.pretrain.run.epochs=9   a recipe of stages, with a changed value of one of them
+  train select runs/mine                  choose among a run's checkpoints by return, success, pose and KL
 
 Exit codes: 0 done, 1 failed while running, 2 bad usage or recipe, 130 interrupted (after saving)."
 )]
 struct Args {
+    #[command(subcommand)]
+    command: Option<Command>,
     /// An embedded recipe (see --list) or a path ending in .toml
     #[arg(default_value = "quick")]
     recipe: String,
@@ -58,7 +66,7 @@ struct Args {
     /// Change a value of the recipe, e.g. ppo.clip=0.2; repeatable
     #[arg(long = "set", value_name = "KEY.PATH=VALUE")]
     set: Vec<String>,
-    /// Continue the run in this folder; can change only run.epochs, checkpoint.* and test.*
+    /// Continue the run in this folder; can change only run.epochs, checkpoint.*, test.* and select.*
     #[arg(long, value_name = "DIR", conflicts_with_all = ["recipe", "out", "seed", "list"])]
     resume: Option<PathBuf>,
     /// Start from the weights of this policy bundle; its network must be the recipe's
@@ -67,6 +75,22 @@ struct Args {
     /// Threads to use; results do not depend on it [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Play a run's checkpoints from the same starts, choose one by the rule [select] of its recipe (or the rule's defaults), write
+    /// selection.json and pack it into policy/
+    Select {
+        /// A run folder; of a run in stages, the folder of one of them
+        dir: PathBuf,
+        /// Change a value of the rule, e.g. select.starts=400; repeatable
+        #[arg(long = "set", value_name = "select.KEY=VALUE")]
+        set: Vec<String>,
+        /// Threads to use; results do not depend on it [default: all cores]
+        #[arg(long)]
+        threads: Option<usize>,
+    },
 }
 
 /// Runs the program with the environments of `registry` and the process's arguments.
@@ -82,6 +106,14 @@ pub fn run(registry: &Registry) -> ExitCode {
 }
 
 fn act(args: &Args, registry: &Registry) -> Result<u8> {
+    keep_memory();
+    match &args.command {
+        Some(Command::Select { dir, set, threads }) => {
+            start_threads(*threads)?;
+            return choose(dir, set, registry);
+        }
+        None => {}
+    }
     if args.list {
         for (name, text) in EMBEDDED {
             println!("{name:<24} {}", Recipe::parse(name, text, &[])?.about);
@@ -93,28 +125,49 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
         None => Recipe::load(&args.recipe, &args.set)?,
     };
     recipe.seed = args.seed.unwrap_or(recipe.seed);
-    let plan = recipe.plan()?;
-    keep_memory();
+    let scheme = Scheme::new(recipe)?;
     // Before anything computes, and reading a bundle does.
     let threads = start_threads(args.threads)?;
     let init = args.init.as_deref().map(Bundle::read).transpose().given()?;
     if args.dry_run {
-        return describe(plan, registry, init.as_ref(), threads, args.seeds);
+        return describe(scheme, registry, init.as_ref(), threads, args.seeds);
     }
     let stop = watch()?;
+    let name = &scheme.recipe.name;
     if let Some(count) = args.seeds {
-        let dir = args.out.clone().unwrap_or_else(|| Path::new("runs").join(format!("{}-seeds", plan.recipe.name)));
-        return Ok(code(Seeds { plan, registry, dir, threads, init }.run(count, &stop)?));
+        let dir = args.out.clone().unwrap_or_else(|| Path::new("runs").join(format!("{name}-seeds")));
+        return Ok(code(Seeds { recipe: scheme.recipe, registry, dir, threads, init }.run(count, &stop)?));
     }
-    let mut trainer = match &args.resume {
-        Some(dir) => Trainer::resume(plan, registry, dir, threads, |what| eprintln!("warning: {what}"))?,
+    let dir = match &args.resume {
+        Some(dir) => dir.clone(),
         None => {
-            let dir = run_folder(args.out.as_deref(), &plan.recipe.name)?;
-            eprintln!("training '{}' into {}", plan.recipe.name, dir.display());
-            Trainer::start(plan, registry, &dir, threads, init.as_ref())?
+            let dir = run_folder(args.out.as_deref(), name)?;
+            eprintln!("training '{name}' into {}", dir.display());
+            dir
         }
     };
-    Ok(code(trainer.run(&stop)?))
+    let job = Job { scheme: &scheme, registry, dir: &dir, threads, init: init.as_ref() };
+    Ok(code(job.run(args.resume.is_some(), &stop, &|_| Ok(()))?))
+}
+
+/// Selects among the checkpoints of the run in `dir`.
+fn choose(dir: &Path, set: &[String], registry: &Registry) -> Result<u8> {
+    if let Some(change) = set.iter().find(|c| !c.starts_with("select.")) {
+        return Err(Error::config(format!("--set {change}: expected select.KEY=VALUE")));
+    }
+    let recipe = of_run(dir, set)?;
+    if let Some(stage) = recipe.stages.last() {
+        let folder = dir.join("stages").join(format!("{}-{}", recipe.stages.len(), stage.name));
+        return Err(Error::config(format!("{}: is a run in stages; give one of them, such as {}", dir.display(), folder.display())));
+    }
+    let rule = recipe.select.clone().unwrap_or_default();
+    rule.check()?;
+    let stop = watch()?;
+    let Some(selection) = select(dir, &recipe, &rule, registry, &stop)? else { return Ok(INTERRUPTED) };
+    selection.write(dir)?;
+    export(&dir.join("checkpoints").join(&selection.chosen), &dir.join("policy"))?;
+    println!("{}: {}", selection.chosen, selection.why);
+    Ok(0)
 }
 
 /// What Ctrl-C sets.
@@ -166,13 +219,30 @@ pub(crate) fn run_folder(given: Option<&Path>, name: &str) -> Result<PathBuf> {
     }
 }
 
-fn describe(plan: Plan, registry: &Registry, init: Option<&Bundle>, threads: usize, seeds: Option<NonZeroU64>) -> Result<u8> {
+fn describe(scheme: Scheme, registry: &Registry, init: Option<&Bundle>, threads: usize, seeds: Option<NonZeroU64>) -> Result<u8> {
+    println!("{}", scheme.recipe.to_toml()?);
+    let (mut seconds, staged) = (0.0, scheme.staged());
+    for (i, part) in scheme.parts.into_iter().enumerate() {
+        if staged {
+            println!("# stage {}, {}", i + 1, part.name);
+        }
+        seconds += describe_part(part.plan, registry, init.filter(|_| i == 0), threads)?;
+    }
+    let runs = seeds.map_or(String::new(), |n| format!(", {:.1} minutes for {n} seeds", seconds * n.get() as f64 / 60.0));
+    println!("# time: about {:.1} minutes on {threads} threads{runs}", seconds / 60.0);
+    if let Some(peak) = peak_memory() {
+        println!("# memory: about {peak}");
+    }
+    Ok(0)
+}
+
+/// Sizes of a stage; gives the seconds that it would take.
+fn describe_part(plan: Plan, registry: &Registry, init: Option<&Bundle>, threads: usize) -> Result<f64> {
     let recipe = &plan.recipe;
     let made = registry.make(&recipe.env, &recipe.env_options, 1, Purpose::Test)?;
     let spec = policy_spec(&plan, made.env.spec())?;
-    init.map(|bundle| initial(bundle, &spec, &made.origin)).transpose()?;
+    init.map(|bundle| initial("--init", bundle, &spec, &made.origin)).transpose()?;
     let per_epoch = plan.updates_per_epoch * recipe.run.collect_steps as u64;
-    println!("{}", recipe.to_toml()?);
     let action = match spec.action {
         ActionSpace::Continuous(n) => format!("{n} floats"),
         ActionSpace::Discrete(k) => format!("one of {k}"),
@@ -181,13 +251,7 @@ fn describe(plan: Plan, registry: &Registry, init: Option<&Bundle>, threads: usi
     println!("# parameters: {}", spec.params());
     println!("# updates: {} per epoch, each from {} environments x {} steps", plan.updates_per_epoch, recipe.run.envs, plan.horizon);
     println!("# environment steps: {per_epoch} per epoch, {} in all", per_epoch * recipe.run.epochs);
-    let seconds = Trainer::estimate(plan, registry, threads)?;
-    let runs = seeds.map_or(String::new(), |n| format!(", {:.1} minutes for {n} seeds", seconds * n.get() as f64 / 60.0));
-    println!("# time: about {:.1} minutes on {threads} threads{runs}", seconds / 60.0);
-    if let Some(peak) = peak_memory() {
-        println!("# memory: about {peak}");
-    }
-    Ok(0)
+    Trainer::estimate(plan, registry, threads)
 }
 
 /// The most memory that this process has had so far, as Linux states it; `None` on other systems.

@@ -79,6 +79,15 @@ impl Collector {
         Ok(Self { env, seed, obs, result: StepResult::default(), progress })
     }
 
+    /// Goes on in as many other environments of the same kind, reset from `seed`; the running episodes are left.
+    pub fn change(&mut self, mut env: Box<dyn VecEnv>, seed: u64) -> Result<()> {
+        env.reset(seed, &mut self.obs)?;
+        check_obs(env.spec(), &self.obs)?;
+        self.progress.running = vec![(0.0, 0); env.num_envs()];
+        self.env = env;
+        Ok(())
+    }
+
     /// The environments.
     pub fn env(&self) -> &dyn VecEnv {
         self.env.as_ref()
@@ -197,20 +206,51 @@ fn check_finite(width: usize, values: &[f32], name: impl Fn(usize) -> String) ->
     }
 }
 
+/// Who plays the first episode of every environment.
+pub(crate) trait Player {
+    /// The episodes are about to begin.
+    fn begin(&mut self, _env: &dyn VecEnv) {}
+    /// Actions for everyone.
+    fn act(&mut self, obs: &[f32], step: u64) -> Result<Vec<f32>>;
+    /// The environments `playing`, whose episodes had not ended before it, have made a step.
+    fn look(&mut self, _env: &dyn VecEnv, _playing: &[usize]) {}
+}
+
+/// A policy in its tests.
+struct Tested<'a> {
+    policy: &'a Policy,
+    seed: u64,
+    noise: bool,
+}
+
+impl Player for Tested<'_> {
+    fn act(&mut self, obs: &[f32], step: u64) -> Result<Vec<f32>> {
+        let acts = self.policy.act(obs)?;
+        Ok(if self.noise { acts.sample(self.seed, "test actions", step) } else { acts.best() })
+    }
+}
+
 /// The first episode of every environment after a reset from `seed`; with the policy's noise or without.
 pub fn test_episodes(env: &mut dyn VecEnv, policy: &Policy, seed: u64, noise: bool) -> Result<Vec<Episode>> {
+    Ok(first_episodes(env, seed, &mut Tested { policy, seed, noise })?.into_iter().flatten().collect())
+}
+
+/// The first episode of every environment after a reset from `seed`; none where it takes too long.
+pub(crate) fn first_episodes(env: &mut dyn VecEnv, seed: u64, player: &mut dyn Player) -> Result<Vec<Option<Episode>>> {
     let (envs, figures) = (env.num_envs(), env.spec().episode.len());
     let (mut obs, mut result) = (Vec::new(), StepResult::default());
     let mut running = vec![(0.0, 0); envs];
     let mut done: Vec<Option<Episode>> = vec![None; envs];
     env.reset(seed, &mut obs)?;
     check_obs(env.spec(), &obs)?;
+    player.begin(env);
     for step in 0.. {
-        let acts = policy.act(&obs)?;
-        let actions = if noise { acts.sample(seed, "test actions", step) } else { acts.best() };
+        let actions = player.act(&obs, step)?;
         env.step(&actions, &mut result)?;
         check_result(env.spec(), &result).map_err(|e| Error::run(format!("in step {} of the test: {e}", step + 1)))?;
-        for i in (0..envs).filter(|&i| done[i].is_none()).collect::<Vec<_>>() {
+        let playing: Vec<usize> = (0..envs).filter(|&i| done[i].is_none()).collect();
+        player.look(env, &playing);
+        for i in playing {
             running[i].0 += result.reward[i];
             running[i].1 += 1;
             if result.terminated[i] || result.truncated[i] {
@@ -223,7 +263,7 @@ pub fn test_episodes(env: &mut dyn VecEnv, policy: &Policy, seed: u64, noise: bo
         }
         std::mem::swap(&mut obs, &mut result.obs);
     }
-    Ok(done.into_iter().flatten().collect())
+    Ok(done)
 }
 
 /// Episodes longer than this do not count in tests.

@@ -1,5 +1,8 @@
 //! Recipes: what a person can train, as TOML; checked once into a [`Plan`].
 
+use crate::course::{Curriculum, Goal};
+use crate::select::SelectConfig;
+use crate::stages::Stage;
 use crate::{AdamConfig, Error, PpoConfig, Result, Schedule};
 use egogen::agent::PolicyConfig;
 use egogen::device::DeviceChoice;
@@ -8,8 +11,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The recipes that come with the program: file stem and content.
-pub const EMBEDDED: [(&str, &str); 8] = [
+pub const EMBEDDED: [(&str, &str); 9] = [
     ("quick", include_str!("../recipes/quick.toml")),
+    ("crowded", include_str!("../recipes/crowded.toml")),
     ("paper", include_str!("../recipes/paper.toml")),
     ("point", include_str!("../recipes/point.toml")),
     ("cartpole", include_str!("../recipes/cartpole.toml")),
@@ -46,9 +50,21 @@ pub struct Recipe {
     pub test: TestConfig,
     /// What is kept.
     pub checkpoint: CheckpointConfig,
+    /// How the run's policy is selected; absent: by `checkpoint.best`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub select: Option<SelectConfig>,
+    /// What ends the run before `run.epochs`; looked at in tests.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub until: Option<Goal>,
     /// Options of the environment, checked by its factory.
     #[serde(default)]
     pub env_options: toml::Table,
+    /// Options of the environment that change while training goes on.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub curriculum: Vec<Curriculum>,
+    /// What is trained one after the other; absent: the recipe as it is.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub stages: Vec<Stage>,
 }
 
 /// How much is trained.
@@ -146,8 +162,12 @@ impl Recipe {
         toml::to_string(self).map_err(|e| Error::run(format!("cannot write the recipe: {e}")))
     }
 
-    /// Checks every value.
+    /// Checks every value of a recipe without stages; see [`crate::stages::Scheme`] for the others.
     pub fn plan(self) -> Result<Plan> {
+        if let Some(stage) = self.stages.first() {
+            return Err(Error::config(format!("recipe '{}': stages begin with '{}', expected none here", self.name, stage.name)));
+        }
+        self.check_rules()?;
         let run = &self.run;
         let positive = [
             ("run.epoch_steps", run.epoch_steps),
@@ -208,6 +228,22 @@ impl Recipe {
         Ok(Plan { horizon, updates_per_epoch, recipe: self })
     }
 
+    /// Checks what looks at figures and options: selection, convergence, curricula.
+    fn check_rules(&self) -> Result<()> {
+        let named = |e: Error| Error::config(format!("recipe '{}': {e}", self.name));
+        if let Some(rule) = &self.select {
+            rule.check().map_err(named)?;
+            self.expect("checkpoint.keep_every", "not set", self.checkpoint.keep_every.is_some(), "a number, for [select] to choose from")?;
+        }
+        self.until.iter().try_for_each(|goal| goal.check("until")).map_err(named)?;
+        for (i, entry) in self.curriculum.iter().enumerate() {
+            entry.check(&format!("curriculum {}", i + 1)).map_err(named)?;
+            let again = self.curriculum[..i].iter().any(|other| other.key == entry.key);
+            self.expect(&format!("curriculum {}.key", i + 1), &entry.key, !again, "a key that no other curriculum has")?;
+        }
+        Ok(())
+    }
+
     fn expect(&self, key: &str, value: impl std::fmt::Display, holds: bool, want: &str) -> Result<()> {
         if holds { Ok(()) } else { Err(Error::config(format!("recipe '{}': {key} is {value}, expected {want}", self.name))) }
     }
@@ -220,15 +256,35 @@ fn set(table: &mut toml::Table, change: &str) -> Result<()> {
     };
     let parsed = toml::from_str::<toml::Table>(&format!("v = {value}")).ok().and_then(|mut t| t.remove("v"));
     let value = parsed.unwrap_or_else(|| toml::Value::String(value.into()));
-    let keys: Vec<&str> = path.trim().split('.').collect();
-    let (last, parents) = keys.split_last().expect("split yields one part");
+    put(table, path.trim(), value).map_err(|e| Error::config(format!("--set {change}: {e}")))
+}
+
+/// Puts a value under a dotted path. An entry of a list of tables goes by its `name`, or by its number from 1.
+pub(crate) fn put(table: &mut toml::Table, path: &str, value: toml::Value) -> std::result::Result<(), String> {
+    let (parents, last) = path.rsplit_once('.').map_or((None, path), |(parents, last)| (Some(parents), last));
+    let mut keys = parents.into_iter().flat_map(|p| p.split('.'));
     let mut at = table;
-    for key in parents {
-        let next = at.entry(*key).or_insert_with(|| toml::Value::Table(toml::Table::new()));
-        at = next.as_table_mut().ok_or_else(|| Error::config(format!("--set {change}: '{key}' is a value, not a table")))?;
+    while let Some(key) = keys.next() {
+        at = match at.entry(key).or_insert_with(|| toml::Value::Table(toml::Table::new())) {
+            toml::Value::Table(inner) => inner,
+            toml::Value::Array(list) => {
+                let names: Vec<String> = list.iter().enumerate().map(|(i, entry)| name_of(i, entry)).collect();
+                let which = keys.next().ok_or_else(|| format!("'{key}' is a list: name an entry and a key of it"))?;
+                let found = names.iter().position(|n| n == which);
+                let found = found.or_else(|| which.parse::<usize>().ok()?.checked_sub(1));
+                let entry = found.and_then(|i| list.get_mut(i)).and_then(toml::Value::as_table_mut);
+                entry.ok_or_else(|| format!("'{key}' is a list, which has no '{which}', expected one of: {}", names.join(", ")))?
+            }
+            _ => return Err(format!("'{key}' is a value, not a table")),
+        };
     }
     at.insert(last.to_string(), value);
     Ok(())
+}
+
+/// What entry `i` of a list of tables is called: its `name`, or its number from 1.
+fn name_of(i: usize, entry: &toml::Value) -> String {
+    entry.get("name").and_then(toml::Value::as_str).map_or_else(|| (i + 1).to_string(), String::from)
 }
 
 /// `base` with `key.path=value` changes; `what` names it in errors.
@@ -245,7 +301,13 @@ pub fn changed<T: Serialize + serde::de::DeserializeOwned>(what: &str, base: T, 
 }
 
 /// What a continued run may change.
-const MAY: [&str; 3] = ["run.epochs", "checkpoint.", "test."];
+const MAY: [&str; 4] = ["run.epochs", "checkpoint.", "test.", "select."];
+
+/// Whether a continued run may change `key`, be it of a stage.
+fn may(key: &str) -> bool {
+    let own = key.strip_prefix("stages.").and_then(|rest| rest.split_once('.')).map_or(key, |(_, own)| own);
+    MAY.iter().any(|m| own.starts_with(m))
+}
 
 /// The first key, of those that a continued run may not change, in which recipes differ, with both values.
 pub fn difference(a: &Recipe, b: &Recipe) -> Result<Option<(String, [String; 2])>> {
@@ -257,7 +319,7 @@ pub fn difference(a: &Recipe, b: &Recipe) -> Result<Option<(String, [String; 2])
         Ok(values.into_iter().map(|(key, value)| ((key.contains('.'), key), value)).collect())
     });
     let (a, b) = (a?, b?);
-    let binding = |key: &str| key != "about" && !MAY.iter().any(|m| key.starts_with(m));
+    let binding = |key: &str| key != "about" && !may(key);
     let keys = a.keys().chain(b.keys()).filter(|(_, key)| binding(key));
     let shown = |of: &BTreeMap<(bool, String), String>, key| of.get(key).cloned().unwrap_or_else(|| "not set".into());
     let first = keys.filter(|key| a.get(*key) != b.get(*key)).min();
@@ -269,6 +331,10 @@ fn flatten(prefix: &str, table: &toml::Table, out: &mut BTreeMap<String, String>
     for (key, value) in table {
         match value {
             toml::Value::Table(inner) => flatten(&format!("{prefix}{key}."), inner, out),
+            toml::Value::Array(list) if !list.is_empty() && list.iter().all(toml::Value::is_table) => {
+                let entries = list.iter().enumerate().filter_map(|(i, entry)| Some((name_of(i, entry), entry.as_table()?)));
+                entries.for_each(|(name, entry)| flatten(&format!("{prefix}{key}.{name}."), entry, out));
+            }
             value => _ = out.insert(format!("{prefix}{key}"), value.to_string()),
         }
     }
@@ -276,8 +342,9 @@ fn flatten(prefix: &str, table: &toml::Table, out: &mut BTreeMap<String, String>
 
 /// Reads the resolved recipe of the run in `dir`, with changes that a continued run may make.
 pub fn of_run(dir: &Path, changes: &[String]) -> Result<Recipe> {
-    if let Some(change) = changes.iter().find(|c| !MAY.iter().any(|m| c.starts_with(m))) {
-        return Err(Error::config(format!("--set {change}: a continued run can change only run.epochs, checkpoint.* and test.*")));
+    if let Some(change) = changes.iter().find(|c| !may(c)) {
+        let what = "a continued run can change only run.epochs, checkpoint.*, test.* and select.*, also of its stages";
+        return Err(Error::config(format!("--set {change}: {what}")));
     }
     let path = dir.join("recipe.toml");
     let origin = path.display().to_string();

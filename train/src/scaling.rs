@@ -25,6 +25,11 @@ impl Default for RewardScaling {
 }
 
 impl RewardScaling {
+    /// The same scale for episodes that all begin anew.
+    pub fn anew(self) -> Self {
+        Self { sums: Vec::new(), ..self }
+    }
+
     /// Divides the rewards of a rollout by the standard deviation of the sums seen up to each step, that step included.
     pub fn apply(&mut self, rollout: &mut Rollout, envs: usize, gamma: f32) {
         self.sums.resize(envs, 0.0);

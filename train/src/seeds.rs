@@ -1,17 +1,17 @@
 //! Several seeds of one recipe: a run each, and what they came to together.
 
-use crate::checkpoint;
 use crate::cli::run_folder;
-use crate::recipe::{Plan, difference, of_run};
+use crate::job::{Job, Summary};
+use crate::recipe::{Recipe, difference, of_run};
 use crate::registry::Registry;
+use crate::stages::Scheme;
 use crate::start::INIT;
 use crate::stats::{bootstrap_interval, inter_quartile_mean};
-use crate::trainer::{Outcome, Trainer};
+use crate::trainer::Outcome;
 use crate::{Error, Result};
 use egogen::agent::bundle::Bundle;
 use egogen::io::write_atomic;
 use egogen::rng::stream;
-use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::num::NonZeroU64;
 use std::path::{Path, PathBuf};
@@ -23,10 +23,10 @@ const RESAMPLES: usize = 10_000;
 /// Figures of a run's last epoch by name.
 type Figures = BTreeMap<String, f64>;
 
-/// Runs of one plan that differ in their seeds alone.
+/// Runs of one recipe that differ in their seeds alone.
 pub struct Seeds<'a> {
-    /// The plan with the first seed.
-    pub plan: Plan,
+    /// The recipe with the first seed.
+    pub recipe: Recipe,
     pub registry: &'a Registry,
     /// Holds a folder for each run.
     pub dir: PathBuf,
@@ -39,7 +39,7 @@ impl Seeds<'_> {
     /// Trains `count` seeds one after another, going on where an earlier call stopped, and writes `seeds.csv`.
     pub fn run(&self, count: NonZeroU64, stop: &AtomicBool) -> Result<Outcome> {
         let mut runs = Vec::new();
-        for seed in (self.plan.recipe.seed..).take(count.get() as usize) {
+        for seed in (self.recipe.seed..).take(count.get() as usize) {
             match self.one(seed, stop)? {
                 Some(figures) => runs.push(figures),
                 None => return Ok(Outcome::Interrupted),
@@ -53,51 +53,42 @@ impl Seeds<'_> {
 
     /// The figures of the run of one seed, trained as far as that is left to do; `None` where it was interrupted.
     fn one(&self, seed: u64, stop: &AtomicBool) -> Result<Option<Figures>> {
-        let mut plan = self.plan.clone();
-        plan.recipe.seed = seed;
+        let scheme = Scheme::new(Recipe { seed, ..self.recipe.clone() })?;
         let dir = self.dir.join(format!("seed-{seed}"));
         let noted = dir.join("recipe.toml").exists();
-        if noted && let Some(figures) = self.finished(&plan, &dir)? {
+        if noted && let Some(figures) = self.finished(&scheme, &dir)? {
             eprintln!("{}: is finished", dir.display());
             return Ok(Some(figures));
         }
-        let (registry, threads, init) = (self.registry, self.threads, self.init.as_ref());
-        let lost = init.is_some() && checkpoint::list(&dir.join("checkpoints")).is_empty();
-        let mut trainer = if noted && !lost {
-            eprintln!("{}: goes on", dir.display());
-            Trainer::resume(plan, registry, &dir, threads, |what| eprintln!("warning: {what}"))?
-        } else {
-            let dir = if noted { dir.clone() } else { run_folder(Some(&dir), "")? };
-            eprintln!("{}: begins", dir.display());
-            Trainer::start(plan, registry, &dir, threads, init)?
-        };
-        self.check_init(&dir, trainer.origin())?;
-        let outcome = trainer.run(stop)?;
-        Ok((outcome == Outcome::Finished).then(|| trainer.last_epoch().clone()))
+        let dir = if noted { dir } else { run_folder(Some(&dir), "")? };
+        eprintln!("{}: {}", dir.display(), if noted { "goes on" } else { "begins" });
+        let job = Job { scheme: &scheme, registry: self.registry, dir: &dir, threads: self.threads, init: self.init.as_ref() };
+        match job.run(noted, stop, &|origin| self.check_init(&dir, origin))? {
+            Outcome::Interrupted => Ok(None),
+            Outcome::Finished => Ok(Summary::read(&dir)?.map(|s| s.last_epoch)),
+        }
     }
 
     /// The figures of a run that has come to its end. Refuses one of another recipe.
-    fn finished(&self, plan: &Plan, dir: &Path) -> Result<Option<Figures>> {
+    fn finished(&self, scheme: &Scheme, dir: &Path) -> Result<Option<Figures>> {
         let theirs = of_run(dir, &[])?;
         let other = |file: &str, key: &str, was: &str, is: &str| {
             let path = dir.join(file);
             Err(Error::config(format!("{}: {key} is {was}, expected {is}; give another --out", path.display())))
         };
-        if let Some((key, [was, is])) = difference(&theirs, &plan.recipe)? {
+        if let Some((key, [was, is])) = difference(&theirs, &scheme.recipe)? {
             return other("recipe.toml", &key, &was, &is);
         }
-        let path = dir.join("summary.json");
-        let Ok(text) = std::fs::read_to_string(&path) else { return Ok(None) };
-        let summary: Summary = serde_json::from_str(&text).map_err(|e| egogen::Error::file(&path, e.to_string()))?;
-        let epochs = plan.recipe.run.epochs;
-        if summary.epochs < epochs {
+        let Some(summary) = Summary::read(dir)? else { return Ok(None) };
+        let epochs = scheme.epochs();
+        if summary.epochs < epochs && !summary.converged {
             return Ok(None);
         }
         if summary.epochs > epochs {
             return other("summary.json", "epochs", &summary.epochs.to_string(), &epochs.to_string());
         }
-        if theirs.test != plan.recipe.test {
-            return other("recipe.toml", "[test]", &format!("{:?}", theirs.test), &format!("{:?}", plan.recipe.test));
+        if theirs.test != scheme.recipe.test {
+            return other("recipe.toml", "[test]", &format!("{:?}", theirs.test), &format!("{:?}", scheme.recipe.test));
         }
         self.check_init(dir, &summary.origin)?;
         Ok(Some(summary.last_epoch))
@@ -113,14 +104,6 @@ impl Seeds<'_> {
         let what = format!("began with {}, expected {}; give another --out", name(was), name(is.as_ref()));
         Err(Error::config(format!("{}: {what}", dir.display())))
     }
-}
-
-/// What is read of a run's `summary.json`.
-#[derive(Deserialize)]
-struct Summary {
-    epochs: u64,
-    origin: BTreeMap<String, String>,
-    last_epoch: Figures,
 }
 
 /// Every figure of the last test over the runs that have it, as CSV: inter-quartile mean with its bootstrap interval, mean, smallest

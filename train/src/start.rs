@@ -4,10 +4,12 @@ use crate::checkpoint::{self, Checkpoint, DESCRIPTION, RECIPE, STATE};
 use crate::collector::Collector;
 use crate::logger::Csv;
 use crate::recipe::{Plan, Recipe, difference};
+use crate::ppo::Progress;
 use crate::stats::{Episodes, EpochStats};
-use crate::{Error, Result, Running};
-use egogen::agent::bundle::Bundle;
+use crate::{AdamW, Error, Result, RewardScaling, Running};
+use egogen::agent::bundle::{Bundle, Trained};
 use egogen::agent::{ObsLayout, PolicySpec};
+use egogen::io::Precision;
 use egogen_envs::{ActionSpace, EnvSpec};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -19,8 +21,38 @@ pub(crate) const INIT: &str = "init";
 pub(crate) enum Start<'a> {
     Seed,
     Policy(&'a Bundle),
+    /// A checkpoint of the stage before.
+    Stage(Box<Carried>),
     /// The run's newest checkpoint; the function hears of those that cannot be used.
     Resume(&'a mut dyn FnMut(String)),
+}
+
+/// What one stage hands to the next: weights, and what normalisers have come to.
+pub(crate) struct Carried {
+    /// The weights, in single precision.
+    pub bundle: Bundle,
+    pub learning: Progress,
+    pub scaling: RewardScaling,
+    /// The optimiser, where it comes along.
+    pub adam: Option<AdamW>,
+}
+
+impl Carried {
+    /// Takes the checkpoint in the folder `dir`.
+    pub fn read(dir: &Path, optimiser: bool) -> Result<Self> {
+        let c = Checkpoint::read(dir)?;
+        let d = c.description;
+        let spec = PolicySpec::new(d.policy, d.layout, d.action)?;
+        let trained = Trained { recipe: d.recipe, seed: d.seed, epoch: d.epoch, env_steps: d.env_steps, test: d.test };
+        let old = c.state.learning;
+        let learning = Progress { updates: 0, learning_rate: old.learning_rate.filter(|_| optimiser), ..old };
+        Ok(Self {
+            bundle: Bundle::with_precision(spec, &c.params, d.origin, trained, Precision::Full)?,
+            learning,
+            scaling: c.state.scaling.anew(),
+            adam: optimiser.then_some(c.adam),
+        })
+    }
 }
 
 /// The policy that a plan trains in these environments.
@@ -45,28 +77,33 @@ pub(crate) fn seen(bundle: &Bundle) -> Vec<Running> {
     mean.iter().zip(std).map(one).collect()
 }
 
-/// The weights of `bundle` for a policy of these sizes that stands on `origin`.
-pub(crate) fn initial(bundle: &Bundle, spec: &PolicySpec, origin: &BTreeMap<String, String>) -> Result<Vec<f32>> {
-    let bad = |e: egogen::Error| Error::config(format!("--init: {e}"));
+/// The weights of `bundle` for a policy of these sizes that stands on `origin`; `key` says in errors who gave it.
+pub(crate) fn initial(key: &str, bundle: &Bundle, spec: &PolicySpec, origin: &BTreeMap<String, String>) -> Result<Vec<f32>> {
+    let bad = |e: egogen::Error| Error::config(format!("{key}: {e}"));
     let params = bundle.weights_for(spec).map_err(bad)?;
     origin.iter().try_for_each(|(what, hash)| bundle.require(what, hash)).map_err(bad)?;
     Ok(params)
 }
 
-/// The checkpoint that the run in `dir` continues from, loaded into `collector`; clears up what a kill left half done.
+/// The checkpoint that the run in `dir` continues from, loaded into what `make` makes for its curricula's levels; clears up what a
+/// kill left half done.
 pub(crate) fn find(
     dir: &Path,
     recipe: &Recipe,
     spec: &PolicySpec,
     origin: &BTreeMap<String, String>,
-    collector: &mut Collector,
+    make: &dyn Fn(&[usize]) -> Result<Collector>,
     warn: &mut dyn FnMut(String),
-) -> Result<Option<Checkpoint>> {
+) -> Result<Option<(Checkpoint, Collector)>> {
     let root = dir.join("checkpoints");
+    let mut loaded = None;
     let accept = |c: &Checkpoint| {
         let folder = root.join(c.name());
         check_same(c, &folder, recipe, spec, origin)?;
-        collector.load(&c.state.collector).map_err(|e| egogen::Error::file(folder.join(STATE), e.to_string()).into())
+        let mut collector = make(&c.state.course.levels)?;
+        collector.load(&c.state.collector).map_err(|e| egogen::Error::file(folder.join(STATE), e.to_string()))?;
+        loaded = Some(collector);
+        Ok(())
     };
     let mut from = checkpoint::newest(&root, accept, &mut *warn)?;
     match &mut from {
@@ -86,7 +123,7 @@ pub(crate) fn find(
         }
     }
     [dir, &root, &dir.join("policy")].into_iter().try_for_each(checkpoint::sweep)?;
-    Ok(from)
+    Ok(from.zip(loaded))
 }
 
 /// A run goes on only with what it began with.
@@ -115,12 +152,16 @@ fn check_same(c: &Checkpoint, folder: &Path, recipe: &Recipe, spec: &PolicySpec,
     }
 }
 
-/// The figure that chooses checkpoints must be one that is reported.
-pub(crate) fn check_best(best: &str, env: &EnvSpec) -> Result<()> {
+/// Figures that rules go by must be ones that are reported.
+pub(crate) fn check_figures(recipe: &Recipe, env: &EnvSpec) -> Result<()> {
     let rows = [EpochStats::default().row(env), Episodes::default().row("test_sto", env), Episodes::default().row("test_det", env)];
     let names: Vec<String> = rows.into_iter().flatten().map(|(name, _)| name).collect();
-    if names.iter().any(|n| n == best) {
-        return Ok(());
+    let mut wanted = vec![("checkpoint.best".to_string(), &recipe.checkpoint.best)];
+    wanted.extend(recipe.until.iter().map(|goal| ("until.figure".into(), &goal.figure)));
+    let goals = recipe.curriculum.iter().zip(1..).filter_map(|(c, i)| Some((i, c.advance.as_ref()?)));
+    wanted.extend(goals.map(|(i, goal)| (format!("curriculum {i}.advance.figure"), &goal.figure)));
+    match wanted.into_iter().find(|(_, figure)| !names.contains(figure)) {
+        Some((key, figure)) => Err(Error::config(format!("{key} is '{figure}', expected one of: {}", names.join(", ")))),
+        None => Ok(()),
     }
-    Err(Error::config(format!("checkpoint.best is '{best}', expected one of: {}", names.join(", "))))
 }

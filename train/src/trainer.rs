@@ -3,19 +3,24 @@
 use crate::checkpoint::{self, Best, Checkpoint, Description, State};
 use crate::clock::Clock;
 use crate::collector::{Collector, test_episodes};
+use crate::course::{Course, columns, last_levels, options};
 use crate::logger::{Console, Csv, Logger};
 use crate::policy::Compute;
 use crate::ppo::{Learner, Progress, Rules};
-use crate::recipe::Plan;
+use crate::recipe::{Plan, Recipe, RunConfig};
 use crate::registry::{Purpose, Registry};
 use crate::shards::Shards;
-use crate::start::{INIT, Start, check_best, find, initial, policy_spec, seen};
+use crate::select::select;
+use crate::start::{Carried, INIT, Start, check_figures, find, initial, policy_spec, seen};
 use crate::stats::{Episodes, EpochStats, Row};
 use crate::tensorboard::TensorBoard;
 use crate::{AdamW, Error, Result, RewardScaling};
+use egogen::agent::PolicySpec;
 use egogen::agent::bundle::{Bundle, Trained};
 use egogen::io::write_atomic;
+use egogen::rng::stream;
 use egogen_envs::{EnvSpec, VecEnv};
+use rand::RngExt;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -34,8 +39,9 @@ pub enum Outcome {
 const MEASURED: f64 = 0.5;
 
 /// A run in its folder.
-pub struct Trainer {
+pub struct Trainer<'a> {
     plan: Plan,
+    registry: &'a Registry,
     dir: PathBuf,
     origin: BTreeMap<String, String>,
     env_spec: EnvSpec,
@@ -49,24 +55,42 @@ pub struct Trainer {
     best: Option<Best>,
     last_test: BTreeMap<String, f64>,
     last_epoch: BTreeMap<String, f64>,
+    course: Course,
 }
 
-impl Trainer {
+impl<'a> Trainer<'a> {
     /// Starts a run in the new folder `dir`; from the weights of the policy `init`, where one is given.
-    pub fn start(plan: Plan, registry: &Registry, dir: &Path, threads: usize, init: Option<&Bundle>) -> Result<Self> {
-        let run = Self::build(plan, registry, dir, threads, init.map_or(Start::Seed, Start::Policy))?.note_recipe()?;
-        // Resuming knows no other way to these weights.
-        init.map_or(Ok(()), |_| run.save())?;
+    pub fn start(plan: Plan, registry: &'a Registry, dir: &Path, threads: usize, init: Option<&Bundle>) -> Result<Self> {
+        Self::begin(plan, registry, dir, threads, init.map_or(Start::Seed, Start::Policy))
+    }
+
+    /// Starts a run in the new folder `dir`.
+    pub(crate) fn begin(plan: Plan, registry: &'a Registry, dir: &Path, threads: usize, start: Start) -> Result<Self> {
+        let fresh = matches!(start, Start::Seed);
+        let run = Self::build(plan, registry, dir, threads, start)?.note_recipe()?;
+        // Resuming knows no other way to weights that do not come from the seed.
+        if !fresh {
+            run.save()?;
+        }
         Ok(run)
     }
 
     /// Continues the run in `dir` from its newest usable checkpoint, or from the start where it was killed before the first.
-    pub fn resume(plan: Plan, registry: &Registry, dir: &Path, threads: usize, mut warn: impl FnMut(String)) -> Result<Self> {
+    pub fn resume(plan: Plan, registry: &'a Registry, dir: &Path, threads: usize, mut warn: impl FnMut(String)) -> Result<Self> {
         Self::build(plan, registry, dir, threads, Start::Resume(&mut warn))?.note_recipe()
     }
 
+    /// Whether the plan fits its environment; the policy that it trains there.
+    pub(crate) fn check(plan: &Plan, registry: &Registry) -> Result<PolicySpec> {
+        let recipe = &plan.recipe;
+        let made = registry.make(&recipe.env, &options(recipe, &last_levels(recipe))?, 1, Purpose::Test)?;
+        check_figures(recipe, made.env.spec())?;
+        check_levels(recipe, registry, made.env.spec())?;
+        policy_spec(plan, made.env.spec())
+    }
+
     /// Seconds that a whole run of this plan takes here, from some updates and one test of an untrained policy. Writes nothing.
-    pub fn estimate(plan: Plan, registry: &Registry, threads: usize) -> Result<f64> {
+    pub fn estimate(plan: Plan, registry: &'a Registry, threads: usize) -> Result<f64> {
         let run = plan.recipe.run;
         let every = plan.recipe.test.every;
         let (updates, tests) = (run.epochs * plan.updates_per_epoch, run.epochs.div_ceil(every));
@@ -89,37 +113,51 @@ impl Trainer {
         Ok(self)
     }
 
-    fn build(plan: Plan, registry: &Registry, dir: &Path, threads: usize, start: Start) -> Result<Self> {
+    fn build(plan: Plan, registry: &'a Registry, dir: &Path, threads: usize, start: Start) -> Result<Self> {
         let recipe = &plan.recipe;
-        let made = registry.make(&recipe.env, &recipe.env_options, recipe.run.envs, Purpose::Train)?;
-        let test_env = registry.make(&recipe.env, &recipe.env_options, recipe.test.episodes, Purpose::Test)?.env;
-        let env_spec = made.env.spec().clone();
+        let goal = options(recipe, &last_levels(recipe))?;
+        let made = registry.make(&recipe.env, &goal, recipe.test.episodes, Purpose::Test)?;
+        let (test_env, mut origin) = (made.env, made.origin);
+        let env_spec = test_env.spec().clone();
         let spec = policy_spec(&plan, &env_spec)?;
-        check_best(&recipe.checkpoint.best, &env_spec)?;
-        let mut collector = Collector::new(made.env, recipe.seed)?;
-        let mut origin = made.origin;
-        let (from, init) = match start {
-            Start::Seed => (None, None),
-            Start::Policy(bundle) => (None, Some(bundle)),
-            Start::Resume(warn) => (find(dir, recipe, &spec, &origin, &mut collector, warn)?, None),
+        check_figures(recipe, &env_spec)?;
+        let make = |levels: &[usize]| Collector::new(training_env(recipe, registry, levels, &env_spec)?, recipe.seed);
+        let (start, from) = match start {
+            Start::Resume(warn) => (Start::Seed, find(dir, recipe, &spec, &origin, &make, warn)?),
+            start => (start, None),
         };
-        let (params, adam, state) = match (from, init) {
-            (Some(c), _) => {
+        let fresh = |params| (params, AdamW::new(spec.learned()), State::default());
+        let (collector, (params, adam, state)) = match from {
+            Some((c, collector)) => {
                 origin = c.description.origin;
-                (c.params, c.adam, c.state)
+                (collector, (c.params, c.adam, c.state))
             }
-            (None, Some(bundle)) => {
-                let params = initial(bundle, &spec, &origin)?;
-                origin.insert(INIT.into(), bundle.weights_hash());
-                let learning = Progress { obs: seen(bundle), ..Progress::default() };
-                (params, AdamW::new(spec.learned()), State { learning, ..State::default() })
+            None => {
+                let collector = make(&[])?;
+                check_levels(recipe, registry, &env_spec)?;
+                let begun = match start {
+                    Start::Policy(bundle) => {
+                        let params = initial("--init", bundle, &spec, &origin)?;
+                        origin.insert(INIT.into(), bundle.weights_hash());
+                        let learning = Progress { obs: seen(bundle), ..Progress::default() };
+                        (params, AdamW::new(spec.learned()), State { learning, ..State::default() })
+                    }
+                    Start::Stage(carried) => {
+                        let Carried { bundle, learning, scaling, adam } = *carried;
+                        let params = initial("the stage before", &bundle, &spec, &origin)?;
+                        origin.insert(INIT.into(), bundle.weights_hash());
+                        (params, adam.unwrap_or_else(|| AdamW::new(spec.learned())), State { learning, scaling, ..State::default() })
+                    }
+                    _ => fresh(spec.init(recipe.seed)),
+                };
+                (collector, begun)
             }
-            (None, None) => (spec.init(recipe.seed), AdamW::new(spec.learned()), State::default()),
         };
         let compute = Compute::new(recipe.device)?;
         let shards = Shards::new(recipe.run.shards, threads)?;
         Ok(Self {
             learner: Learner::new(spec, compute, shards, params, adam, state.learning)?,
+            registry,
             dir: dir.into(),
             origin,
             env_spec,
@@ -132,6 +170,7 @@ impl Trainer {
             best: state.best,
             last_test: state.last_test,
             last_epoch: state.last_epoch,
+            course: state.course,
             plan,
         })
     }
@@ -146,7 +185,7 @@ impl Trainer {
         &self.last_epoch
     }
 
-    /// Trains until all epochs are done or `stop` is set; saves either way. A finished run leaves `policy/` and `summary.json`.
+    /// Trains until all epochs are done, `until` ends it or `stop` is set; saves either way. A finished run leaves `policy/` and `summary.json`.
     pub fn run(&mut self, stop: &AtomicBool) -> Result<Outcome> {
         let epochs = self.plan.recipe.run.epochs;
         let per_epoch = self.plan.updates_per_epoch;
@@ -154,7 +193,7 @@ impl Trainer {
         let mut metrics: [Box<dyn Logger>; 2] =
             [Box::new(Csv::open(&self.dir.join("metrics.csv"), self.epoch)?), Box::new(TensorBoard::new(&self.dir.join("tensorboard"))?)];
         let mut timing = Csv::open(&self.dir.join("timing.csv"), self.epoch)?;
-        while self.epoch < epochs {
+        while self.epoch < epochs && !self.course.ended {
             let mut clock = Clock::default();
             let begun = self.stats.updates;
             while self.stats.updates < per_epoch {
@@ -173,19 +212,39 @@ impl Trainer {
             let left = (epochs - self.epoch) as f64 * per_epoch as f64 * self.plan.recipe.run.collect_steps as f64 / rate;
             console.epoch(self.epoch, &row, rate, left);
             // An interruption's own checkpoint cannot be the best: a run that is not interrupted would not have it.
-            let due = self.epoch.is_multiple_of(self.plan.recipe.checkpoint.every) || self.epoch == epochs;
+            self.follow(&row)?;
+            let done = self.epoch == epochs || self.course.ended;
+            let due = self.epoch.is_multiple_of(self.plan.recipe.checkpoint.every) || done;
             if due {
                 self.select(&row);
             }
             if due || stop.load(Ordering::SeqCst) {
                 self.save()?;
             }
-            if stop.load(Ordering::SeqCst) && self.epoch < epochs {
+            if stop.load(Ordering::SeqCst) && !done {
                 return Ok(Outcome::Interrupted);
             }
         }
-        self.finish()?;
-        Ok(Outcome::Finished)
+        self.finish(stop)
+    }
+
+    /// Lets curricula and the rule of convergence go on by the figures of the epoch just done.
+    fn follow(&mut self, row: &Row) -> Result<()> {
+        let recipe = &self.plan.recipe;
+        let tested = self.test_is_due();
+        if self.course.note(recipe, self.epoch, tested, row) {
+            let env = training_env(recipe, self.registry, &self.course.levels, &self.env_spec)?;
+            // From the same seed, every level would begin with the same episodes.
+            let seed = stream(recipe.seed, "curriculum", self.epoch).random();
+            self.collector.change(env, seed)?;
+            self.scaling = std::mem::take(&mut self.scaling).anew();
+        }
+        Ok(())
+    }
+
+    /// Whether the epoch just done is one that is tested.
+    fn test_is_due(&self) -> bool {
+        self.epoch.is_multiple_of(self.plan.recipe.test.every) || self.epoch == self.plan.recipe.run.epochs
     }
 
     /// What stopped the run, and what is left of it.
@@ -223,10 +282,10 @@ impl Trainer {
         let mut row: Row =
             vec![("updates".into(), Some(self.learner.progress().updates as f64)), ("env_steps".into(), Some(self.env_steps as f64))];
         row.extend(std::mem::take(&mut self.stats).row(&self.env_spec));
-        let test = &self.plan.recipe.test;
-        let due = self.epoch.is_multiple_of(test.every) || self.epoch == self.plan.recipe.run.epochs;
+        let due = self.test_is_due();
         let start = Instant::now();
         row.extend(self.test(due)?);
+        row.extend(columns(&self.plan.recipe, &self.course.levels));
         clock.test = start.elapsed().as_secs_f64();
         if due {
             let tested = row.iter().filter(|(n, _)| n.starts_with("test_"));
@@ -290,6 +349,7 @@ impl Trainer {
                 collector: self.collector.save()?,
                 last_epoch: self.last_epoch.clone(),
                 scaling: self.scaling.clone(),
+                course: self.course.clone(),
             },
         };
         let root = self.dir.join("checkpoints");
@@ -297,13 +357,21 @@ impl Trainer {
         checkpoint::prune(&root, &self.plan.recipe.checkpoint, self.best.as_ref())
     }
 
-    /// Packs the best policy (the last one where no test chose any) and sums the run up.
-    fn finish(&self) -> Result<()> {
+    /// Packs the selected policy, or without `[select]` the best (the last one where no test chose any), and sums the run up.
+    fn finish(&self, stop: &AtomicBool) -> Result<Outcome> {
         let root = self.dir.join("checkpoints");
+        let recipe = &self.plan.recipe;
         let last = checkpoint::list(&root).pop().ok_or_else(|| Error::run("the run wrote no checkpoint"))?;
-        let chosen = self.best.as_ref().map_or(last, |b| b.name.clone());
+        let chosen = match &recipe.select {
+            Some(rule) => {
+                let Some(selection) = select(&self.dir, recipe, rule, self.registry, stop)? else { return Ok(Outcome::Interrupted) };
+                selection.write(&self.dir)?;
+                selection.chosen
+            }
+            None => self.best.as_ref().map_or(last, |b| b.name.clone()),
+        };
         export(&root.join(&chosen), &self.dir.join("policy"))?;
-        let summary = serde_json::json!({
+        let mut summary = serde_json::json!({
             "recipe": self.plan.recipe.name,
             "seed": self.plan.recipe.seed,
             "version": env!("CARGO_PKG_VERSION"),
@@ -315,9 +383,39 @@ impl Trainer {
             "origin": self.origin,
             "last_epoch": self.last_epoch,
         });
+        if recipe.until.is_some() {
+            summary["converged"] = self.course.ended.into();
+        }
         let text = serde_json::to_string_pretty(&summary).map_err(|e| Error::run(format!("cannot write the summary: {e}")))?;
-        Ok(write_atomic(self.dir.join("summary.json"), text.as_bytes())?)
+        write_atomic(self.dir.join("summary.json"), text.as_bytes())?;
+        Ok(Outcome::Finished)
     }
+}
+
+/// The environments for training at these levels of the curricula; they must be such as tests have.
+fn training_env(recipe: &Recipe, registry: &Registry, levels: &[usize], spec: &EnvSpec) -> Result<Box<dyn VecEnv>> {
+    let made = registry.make(&recipe.env, &options(recipe, levels)?, recipe.run.envs, Purpose::Train)?;
+    let own = made.env.spec();
+    if (&own.obs, own.action) == (&spec.obs, spec.action) {
+        return Ok(made.env);
+    }
+    let keys: Vec<&str> = recipe.curriculum.iter().map(|c| c.key.as_str()).collect();
+    let what = "changes what is observed or what an action is, which must stay as it is";
+    Err(Error::config(format!("recipe '{}': a curriculum of {} {what}", recipe.name, keys.join(", "))))
+}
+
+/// Makes an environment with every value of every curriculum, so that a wrong one is told at the start.
+fn check_levels(recipe: &Recipe, registry: &Registry, spec: &EnvSpec) -> Result<()> {
+    let one = Recipe { run: RunConfig { envs: 1, ..recipe.run }, ..recipe.clone() };
+    for (i, entry) in recipe.curriculum.iter().enumerate() {
+        for value in 0..entry.values.len() {
+            let mut levels = last_levels(recipe);
+            levels[i] = value;
+            let named = |e| Error::config(format!("recipe '{}': curriculum of '{}', value {}: {e}", recipe.name, entry.key, value + 1));
+            training_env(&one, registry, &levels, spec).map_err(named)?;
+        }
+    }
+    Ok(())
 }
 
 /// Packs the policy of the checkpoint folder `from` into the bundle folder `to`.

@@ -22,7 +22,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// One task; the value is its state.
-pub trait Dynamics: Clone + Send + Serialize + DeserializeOwned {
+pub trait Dynamics: Clone + Send + Serialize + DeserializeOwned + 'static {
     /// Gymnasium's name, e.g. "CartPole-v1".
     const NAME: &'static str;
     /// Steps after which an episode is cut off.

@@ -3,7 +3,7 @@
 use super::Played;
 use egogen::rng::stream;
 use rand::RngExt;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Resamples of a bootstrap.
 const RESAMPLES: usize = 2000;
@@ -11,7 +11,7 @@ const RESAMPLES: usize = 2000;
 const Z: f64 = 1.959_964;
 
 /// A figure with its 95 % interval.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Estimate {
     pub value: f64,
     pub low: f64,

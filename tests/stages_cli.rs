@@ -141,7 +141,7 @@ fn what_a_later_stage_would_stop_at_is_told_first() {
     let out = dir.path().join("run");
     for (change, words) in [
         ("env_options.speed = 2", ["turn", "env_options.speed"]),
-        ("env = 'pendulum'", ["turn", "differ from those of stage 'walk'"]),
+        ("env = 'pendulum'\ncheckpoint.best = 'test_det/return'", ["turn", "differ from those of stage 'walk'"]),
         ("until = { figure = 'glory', over = 1.0 }", ["until.figure is 'glory'", "test_det/success"]),
         ("ppo.clipp = 0.3", ["turn", "clipp"]),
     ] {
@@ -181,6 +181,44 @@ fn a_run_without_a_rule_can_be_selected_from() {
     refused(&["--set", "ppo.clip=0.1"], "select.KEY");
     refused(&["--set", "select.starts=0"], "select.starts is 0");
     refused(&["--set", "select.start=9"], "start");
+}
+
+/// A page of two seeds of a run in stages beside another run.
+#[test]
+fn runs_are_reported_on_one_page() {
+    let dir = tempfile::tempdir().unwrap();
+    let [staged, plain] = [STAGES, ""].map(|stages| fs::read_to_string(recipe(dir.path(), stages)).unwrap());
+    let (file, seeds, other) = (dir.path().join("a.toml"), dir.path().join("staged"), dir.path().join("plain"));
+    fs::write(&file, staged).unwrap();
+    succeed(&[text(&file), "--seeds", "2", "--out", text(&seeds)]);
+    fs::write(&file, plain).unwrap();
+    succeed(&[text(&file), "--out", text(&other), "--set", "run.epochs=2"]);
+    succeed(&["report", text(&seeds)]);
+    let page = fs::read_to_string(seeds.join("report.html")).unwrap();
+    let chosen = Selection::read(&seeds.join("seed-1/stages/2-turn")).unwrap().unwrap();
+    let words = [
+        "Stages of staged: walk in epochs 1 to 4, turn in epochs 5 to 9.",
+        "Selection: seed-1, stage turn",
+        &format!("Chosen: epoch {}: {}.", chosen.epoch, chosen.why),
+        "success rate",
+        "arrival",
+        "approx_kl",
+        "steps_per_second",
+    ];
+    words.iter().for_each(|w| assert!(page.contains(w), "{w}"));
+    // A border in every panel over epochs, bands over both seeds, rings at what was chosen.
+    assert!(page.matches("stroke-dasharray").count() + page.matches("<polygon").count() > 20);
+    assert!(page.matches("<circle").count() >= 4 * 6);
+    // Nothing that a browser would fetch.
+    let outside = ["<script", "<link", "@import", "url(http", "src=\"http", "href="];
+    outside.iter().for_each(|w| assert!(!page.contains(w), "{w}"));
+
+    let out = dir.path().join("both.html");
+    succeed(&["report", text(&seeds), text(&other), "--out", text(&out)]);
+    let page = fs::read_to_string(&out).unwrap();
+    assert!(["success rate (test, mean action)", ">\nstaged\n<", ">\nplain\n<"].iter().all(|w| page.contains(w)));
+    let output = train(&["report", text(dir.path())]);
+    assert!(output.status.code() == Some(2) && stderr(&output).contains("seed-K"), "{}", stderr(&output));
 }
 
 /// The point with an option `bonus`, which is paid in every step.

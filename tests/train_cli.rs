@@ -7,6 +7,7 @@ use egogen::body::{BETAS, BodyModel, MARKER_DIM, ORIENT, PARAMS, rotation};
 use egogen::motion::{CONTINUOUS, MotionConfig, MotionWeights, PredictorSizes, RegressorSizes};
 use egogen::sim::{SeedBank, SeedMotion};
 use egogen_train::primitives::init;
+use egogen_train::select::{Quality, Selection};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -170,6 +171,8 @@ fn the_motion_task_trains_and_resumes() {
         "test.every=1",
         "checkpoint.every=1",
         "env_options.task.latents=4",
+        "checkpoint.keep_every=1",
+        "select={ starts = 5, finalist_starts = 6 }",
     ];
     let sizes = ["policy.gru={ state = 16, egosensing = 8 }", "policy.trunk=16"];
     let sets: Vec<&str> = small.iter().chain(&sizes).chain([&motion.as_str()]).flat_map(|s| ["--set", s]).collect();
@@ -181,6 +184,14 @@ fn the_motion_task_trains_and_resumes() {
     start(&parts, "run.epochs=1");
     succeed(&["--resume", parts.to_str().unwrap(), "--set", "run.epochs=2"]);
     assert_same_run(&whole, &parts, "epoch-0002");
+    assert_eq!(common::read(&whole, "selection.json"), common::read(&parts, "selection.json"));
+    let selection = Selection::read(&whole).unwrap().unwrap();
+    assert_eq!((selection.candidates.entries.len(), selection.candidates.starts, selection.finalists.starts), (2, 5, 6));
+    let quality = |q: Option<Quality>| q.is_some_and(|q| q.pose_norm > 0.0 && q.bone_error_mm > 0.0);
+    assert!(quality(selection.prior) && selection.candidates.entries.iter().all(|e| quality(e.figures.quality)));
+    succeed(&["report", whole.to_str().unwrap(), "--films", "2"]);
+    let page = fs::read_to_string(whole.join("report.html")).unwrap();
+    assert!(page.contains("The chosen policy: whole") && page.matches("data:image/png;base64,").count() == 2);
     let bundle = egogen::agent::bundle::Bundle::read(&whole.join("policy")).unwrap();
     bundle.require("body", BodyModel::embedded().hash()).unwrap();
     assert!(bundle.require("motion", "another").unwrap_err().to_string().contains("motion another"));

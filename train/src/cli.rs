@@ -1,10 +1,11 @@
 //! The program `train`.
 
 use crate::checkpoint::is_leftover;
-use crate::program::{self, Given, INTERRUPTED};
 use crate::job::Job;
+use crate::program::{self, Given, INTERRUPTED};
 use crate::recipe::{EMBEDDED, Plan, Recipe, of_run};
 use crate::registry::{Purpose, Registry};
+use crate::report::{Group, page};
 use crate::seeds::Seeds;
 use crate::select::select;
 use crate::stages::Scheme;
@@ -14,6 +15,7 @@ use crate::{Error, Result};
 use clap::{Parser, Subcommand};
 use egogen::agent::ActionSpace;
 use egogen::agent::bundle::Bundle;
+use egogen::io::write_atomic;
 use egogen::kernels::keep_memory;
 use std::fs::DirEntry;
 use std::num::NonZeroU64;
@@ -37,6 +39,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
   train my.toml --init runs/mine/policy   start from the weights of a trained policy
   train paper --dry-run                   show what would be done, and how long it would take
   train crowded --set stages.pretrain.run.epochs=9   a recipe of stages, with a changed value of one of them
+  train report runs/mine                  one page with curves, reward terms, selection and pictures
   train select runs/mine                  choose among a run's checkpoints by return, success, pose and KL
 
 Exit codes: 0 done, 1 failed while running, 2 bad usage or recipe, 130 interrupted (after saving)."
@@ -91,6 +94,21 @@ enum Command {
         #[arg(long)]
         threads: Option<usize>,
     },
+    /// Write one HTML page on one or several runs: curves, reward terms, losses, time, stages, selection, and the chosen policy at work
+    Report {
+        /// Run folders, or folders of `train --seeds`
+        #[arg(required = true)]
+        runs: Vec<PathBuf>,
+        /// Held-out starts on which chosen policies are filmed; 0: none
+        #[arg(long, value_name = "N", default_value_t = 8)]
+        films: usize,
+        /// The page [default: report.html in the first folder]
+        #[arg(long, value_name = "FILE")]
+        out: Option<PathBuf>,
+        /// Threads to use; results do not depend on it [default: all cores]
+        #[arg(long)]
+        threads: Option<usize>,
+    },
 }
 
 /// Runs the program with the environments of `registry` and the process's arguments.
@@ -111,6 +129,10 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
         Some(Command::Select { dir, set, threads }) => {
             start_threads(*threads)?;
             return choose(dir, set, registry);
+        }
+        Some(Command::Report { runs, films, out, threads }) => {
+            start_threads(*threads)?;
+            return report(runs, *films, out.as_deref(), registry);
         }
         None => {}
     }
@@ -148,6 +170,20 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
     };
     let job = Job { scheme: &scheme, registry, dir: &dir, threads, init: init.as_ref() };
     Ok(code(job.run(args.resume.is_some(), &stop, &|_| Ok(()))?))
+}
+
+/// Writes the report on the runs in these folders.
+fn report(runs: &[PathBuf], films: usize, out: Option<&Path>, registry: &Registry) -> Result<u8> {
+    let groups = runs.iter().map(|dir| Group::read(dir)).collect::<Result<Vec<_>>>().given()?;
+    if groups.iter().flat_map(|g| &g.runs).flat_map(|r| &r.stages).all(|s| s.metrics.rows() == 0) {
+        return Err(Error::config("none of the runs has a finished epoch"));
+    }
+    let out = out.map_or_else(|| runs[0].join("report.html"), Path::to_path_buf);
+    let named: Vec<String> = runs.iter().map(|dir| dir.display().to_string()).collect();
+    let page = page(&groups, registry, films, &format!("train report {}", named.join(" ")))?;
+    write_atomic(&out, page.as_bytes())?;
+    eprintln!("{}", out.display());
+    Ok(0)
 }
 
 /// Selects among the checkpoints of the run in `dir`.

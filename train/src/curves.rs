@@ -1,5 +1,6 @@
 //! Learning curves as an SVG picture.
 
+use crate::logger::Columns;
 use crate::plot::{Area, COLOURS, Drawn, svg};
 use crate::{Error, Result};
 use plotters::prelude::*;
@@ -19,24 +20,20 @@ const SIZE: (u32, u32) = (1200, 760);
 /// The columns of a run's metrics.csv.
 pub struct Run {
     name: String,
-    columns: BTreeMap<String, Vec<Option<f64>>>,
+    columns: Columns,
 }
 
 impl Run {
     /// Reads the run folder `dir`.
     pub fn read(dir: &Path) -> Result<Self> {
         let path = dir.join("metrics.csv");
-        let text = std::fs::read_to_string(&path).map_err(|e| Error::config(format!("{}: {e}", path.display())))?;
-        let mut lines = text.lines();
-        let names: Vec<&str> = lines.next().unwrap_or_default().split(',').collect();
-        let mut columns: BTreeMap<String, Vec<Option<f64>>> = names.iter().map(|n| (n.to_string(), vec![])).collect();
-        for line in lines {
-            for (name, cell) in names.iter().zip(line.split(',')) {
-                columns.entry(name.to_string()).or_default().push(cell.parse().ok());
-            }
+        let bad = |what: &str| Error::config(format!("{}: {what}", path.display()));
+        if !path.is_file() {
+            return Err(bad("there is no such file; not a run's folder, or one in stages, each of which has its own below stages/"));
         }
-        if !columns.contains_key("env_steps") {
-            return Err(Error::config(format!("{}: has no column env_steps; not a run's metrics", path.display())));
+        let columns = Columns::read(&path)?;
+        if columns.rows() > 0 && !columns.names.iter().any(|n| n == "env_steps") {
+            return Err(bad("has no column env_steps; not a run's metrics"));
         }
         let name = dir.file_name().map_or_else(|| dir.display().to_string(), |n| n.to_string_lossy().into_owned());
         Ok(Self { name, columns })
@@ -44,13 +41,13 @@ impl Run {
 
     /// Finished epochs.
     pub fn rows(&self) -> usize {
-        self.columns["env_steps"].len()
+        self.columns.rows()
     }
 
     /// (thousand environment steps, value) where there is one.
     fn points(&self, column: &str) -> Vec<(f64, f64)> {
-        let Some(values) = self.columns.get(column) else { return vec![] };
-        self.columns["env_steps"].iter().zip(values).filter_map(|(x, y)| Some((x.as_ref()? / 1000.0, (*y)?))).collect()
+        let of = |row| Some((self.columns.get("env_steps", row)? / 1000.0, self.columns.get(column, row)?));
+        (0..self.rows()).filter_map(of).collect()
     }
 }
 

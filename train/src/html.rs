@@ -41,6 +41,7 @@ pub struct Cell {
 }
 
 /// A picture.
+#[derive(Clone, Debug)]
 pub enum Picture {
     /// An SVG document.
     Svg(String),

@@ -23,6 +23,7 @@ pub mod primitives;
 pub mod program;
 pub mod recipe;
 pub mod registry;
+pub mod report;
 mod running;
 mod scaling;
 mod schedule;

@@ -3,6 +3,7 @@
 use crate::stats::Row;
 use crate::{Error, Result};
 use indicatif::{ProgressBar, ProgressStyle};
+use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
@@ -34,6 +35,37 @@ impl Csv {
     /// The last epoch that the file `path` reports; 0 without one.
     pub fn epochs(path: &Path) -> Result<u64> {
         Ok(Rows::of(&read(path)?).lines.last().map_or(0, |(epoch, _)| *epoch))
+    }
+}
+
+/// The columns of a CSV file that [`Csv`] wrote.
+#[derive(Clone, Debug, Default)]
+pub struct Columns {
+    /// In the order of the file, without the first, which counts epochs from 1.
+    pub names: Vec<String>,
+    values: BTreeMap<String, Vec<Option<f64>>>,
+    rows: usize,
+}
+
+impl Columns {
+    /// Reads the whole rows of the file `path`; none where there is no such file.
+    pub fn read(path: &Path) -> Result<Self> {
+        let text = read(path)?;
+        let rows = Rows::of(&text);
+        let names: Vec<String> = rows.header.trim_end().split(',').skip(1).map(String::from).collect();
+        let column = |k: usize| rows.lines.iter().map(|(_, line)| line.trim_end().split(',').nth(k + 1)?.parse().ok()).collect();
+        let values = names.iter().enumerate().map(|(k, name)| (name.clone(), column(k))).collect();
+        Ok(Self { rows: rows.lines.len(), names, values })
+    }
+
+    /// Rows, one for each epoch.
+    pub fn rows(&self) -> usize {
+        self.rows
+    }
+
+    /// The value of a column in row `row`, if it has one.
+    pub fn get(&self, name: &str, row: usize) -> Option<f64> {
+        self.values.get(name)?.get(row).copied().flatten()
     }
 }
 
@@ -162,6 +194,9 @@ mod tests {
         std::fs::write(&path, format!("{whole}1\n1,0.5,")).unwrap();
         Csv::open(&path, 2).unwrap().log(3, &row).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "epoch,a,b\n1,0.5,\n2,0.5,\n3,0.5,\n");
+        let columns = Columns::read(&path).unwrap();
+        assert_eq!((columns.names.join(" ").as_str(), columns.rows()), ("a b", 3));
+        assert_eq!((columns.get("a", 2), columns.get("b", 2), columns.get("a", 3), columns.get("c", 0)), (Some(0.5), None, None, None));
         Csv::open(&path, 0).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "");
         std::fs::write(&path, [0xff]).unwrap();

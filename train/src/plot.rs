@@ -33,6 +33,15 @@ pub struct Series {
     pub spread: Vec<f64>,
 }
 
+/// What stands on lines, beside them.
+#[derive(Clone, Debug, Default)]
+pub struct Marks {
+    /// Places on the x axis where something changes.
+    pub borders: Vec<f64>,
+    /// Points that were chosen.
+    pub chosen: Vec<(f64, f64)>,
+}
+
 /// An SVG picture of `size` pixels on white.
 pub fn svg<D>(size: (u32, u32), draw: D) -> Result<String>
 where
@@ -51,25 +60,43 @@ where
 
 /// Lines with the bands around them; y runs over `y` at least.
 pub fn lines(titles: Titles, y: Range<f64>, series: &[Series]) -> Result<String> {
+    marked_lines(titles, y, series, &Marks::default())
+}
+
+/// [`lines`] with marks: borders dashed, chosen points as rings.
+pub fn marked_lines(titles: Titles, y: Range<f64>, series: &[Series], marks: &Marks) -> Result<String> {
     let band = |s: &Series| {
         let half = s.spread.iter().copied().chain(std::iter::repeat(0.0));
         s.points.iter().zip(half).map(|(&(x, y), d)| (x, y - d, y + d)).collect::<Vec<_>>()
     };
     let all: Vec<_> = series.iter().flat_map(band).collect();
     let x = all.iter().fold(f64::MAX..f64::MIN, |r, p| r.start.min(p.0)..r.end.max(p.0));
-    let y = all.iter().fold(y, |r, p| r.start.min(p.1)..r.end.max(p.2));
+    let y = wide(all.iter().fold(y, |r, p| r.start.min(p.1)..r.end.max(p.2)));
     svg(SIZE, |root| {
-        let mut chart = chart(titles).build_on(root, x, y)?;
+        let mut chart = chart(titles).build_on(root, wide(x), y.clone())?;
+        for &at in &marks.borders {
+            chart.draw_series(DashedLineSeries::new([(at, y.start), (at, y.end)], 4, 4, RGBColor(90, 90, 90).into()))?;
+        }
         for (s, colour) in series.iter().zip(COLOURS.iter().cycle()) {
             if !s.spread.is_empty() {
                 let (low, high): (Vec<_>, Vec<_>) = band(s).into_iter().map(|(x, a, b)| ((x, a), (x, b))).unzip();
                 let ring: Vec<_> = low.into_iter().chain(high.into_iter().rev()).collect();
                 chart.draw_series([Polygon::new(ring, colour.mix(0.18))])?;
             }
-            named(chart.draw_series(LineSeries::new(s.points.iter().copied(), colour.stroke_width(2)))?, &s.name, *colour);
+            let line = chart.draw_series(LineSeries::new(s.points.iter().copied(), colour.stroke_width(2)))?;
+            if !s.name.is_empty() {
+                named(line, &s.name, *colour);
+            }
         }
+        chart.draw_series(marks.chosen.iter().map(|&at| Circle::new(at, 5, BLACK.stroke_width(2))))?;
         legend(&mut chart)
     })
+}
+
+/// An axis on which something can be drawn, even where all values are the same.
+fn wide(range: Range<f64>) -> Range<f64> {
+    let more = if range.end > range.start { 0.0 } else { 0.5 * range.start.abs().max(1.0) };
+    range.start - more..range.end + more
 }
 
 /// Outlines of histograms over the same bins, which divide `x` evenly; heights are shares of each one's sum.
@@ -175,6 +202,11 @@ mod tests {
         let series = Series { name: "feet <1>".into(), points: vec![(0.0, 1.0), (1.0, 2.0)], spread: vec![0.5, 0.25] };
         let plot = lines(TITLES, 0.0..1.0, &[series]).unwrap();
         assert!(plot.starts_with("<svg") && plot.contains("polygon") && plot.contains("drift") && plot.contains("feet &lt;1&gt;"));
+        let series = Series { name: String::new(), points: vec![(0.0, 1.0), (4.0, 2.0)], spread: vec![] };
+        let marks = Marks { borders: vec![2.0], chosen: vec![(4.0, 2.0)] };
+        let circles =
+            |marks: &Marks| marked_lines(TITLES, 0.0..1.0, std::slice::from_ref(&series), marks).unwrap().matches("<circle").count();
+        assert_eq!((circles(&marks), circles(&Marks::default())), (1, 0));
         let plot = histogram(TITLES, -1.0..1.0, &[("a", &[1.0, 3.0]), ("b", &[0.0, 0.0])]).unwrap();
         assert!(plot.matches("<polyline").count() >= 2);
         // Two of three cells are filled.

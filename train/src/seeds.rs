@@ -1,7 +1,7 @@
 //! Several seeds of one recipe: a run each, and what they came to together.
 
 use crate::cli::run_folder;
-use crate::job::{Job, Summary};
+use crate::job::{Job, Summary, stage_folder};
 use crate::recipe::{Recipe, difference, of_run};
 use crate::registry::Registry;
 use crate::stages::Scheme;
@@ -90,7 +90,8 @@ impl Seeds<'_> {
         if theirs.test != scheme.recipe.test {
             return other("recipe.toml", "[test]", &format!("{:?}", theirs.test), &format!("{:?}", scheme.recipe.test));
         }
-        self.check_init(dir, &summary.origin)?;
+        let begin = scheme.staged().then(|| Summary::read(&dir.join(stage_folder(0, &scheme.parts[0].name)))).transpose()?.flatten();
+        self.check_init(dir, begin.as_ref().map_or(&summary.origin, |first| &first.origin))?;
         Ok(Some(summary.last_epoch))
     }
 

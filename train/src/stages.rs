@@ -169,11 +169,17 @@ penetration.most = 40
         assert_eq!((a.run.epochs, b.run.epochs, scheme.epochs()), (3, 12, 15));
         assert_eq!((a.adam.schedule, b.adam.schedule), (crate::Schedule::Constant, crate::Schedule::Linear));
         let task = |r: &Recipe| r.env_options["task"].as_table().unwrap().clone();
-        assert_eq!(task(a), toml::toml! { latents = 4
-            weights = { penetration = 1.0, dist = 2.0 } });
-        assert_eq!(task(b), toml::toml! { latents = 4
+        assert_eq!(
+            task(a),
+            toml::toml! { latents = 4
+            weights = { penetration = 1.0, dist = 2.0 } }
+        );
+        assert_eq!(
+            task(b),
+            toml::toml! { latents = 4
             weights = { penetration = 0.1, dist = 2.0 }
-            penetration = { most = 40 } });
+            penetration = { most = 40 } }
+        );
         assert_eq!((scheme.parts[0].from, scheme.parts[1].from, scheme.parts[1].optimiser), (From::Nothing, From::Last, true));
         // The whole recipe survives being written and read.
         let again = Recipe::parse("again", &scheme.recipe.to_toml().unwrap(), &[]).unwrap();
@@ -186,7 +192,9 @@ penetration.most = 40
         assert_eq!(epochs("stages.finetune.run.epochs=5").unwrap(), [3, 5]);
         assert_eq!(epochs("stages.1.run.epochs=5").unwrap(), [5, 12]);
         assert_eq!(epochs("run.epochs=5").unwrap(), [3, 5], "what a stage says counts for it");
-        for (change, word) in [("stages.3.run.epochs=5", "pretrain, finetune"), ("stages=5", "stages"), ("stages.pretrain=5", "a key of it")] {
+        for (change, word) in
+            [("stages.3.run.epochs=5", "pretrain, finetune"), ("stages=5", "stages"), ("stages.pretrain=5", "a key of it")]
+        {
             let e = epochs(change).unwrap_err().to_string();
             assert!(e.contains(word), "{change}: {e}");
         }

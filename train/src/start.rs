@@ -3,8 +3,8 @@
 use crate::checkpoint::{self, Checkpoint, DESCRIPTION, RECIPE, STATE};
 use crate::collector::Collector;
 use crate::logger::Csv;
-use crate::recipe::{Plan, Recipe, difference};
 use crate::ppo::Progress;
+use crate::recipe::{Plan, Recipe, difference};
 use crate::stats::{Episodes, EpochStats};
 use crate::{AdamW, Error, Result, RewardScaling, Running};
 use egogen::agent::bundle::{Bundle, Trained};

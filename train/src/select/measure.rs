@@ -44,7 +44,10 @@ pub struct Measured {
 
 /// Who acts.
 enum Actor<'a> {
-    Policy { policy: &'a Policy, noise: bool },
+    Policy {
+        policy: &'a Policy,
+        noise: bool,
+    },
     /// Normal noise of that width.
     Prior(usize),
 }

@@ -201,13 +201,7 @@ struct Jury<'a> {
 
 impl Jury<'_> {
     /// The candidates on the starts of `env`, and who is admitted, best first; `None` where it was stopped.
-    fn round(
-        &self,
-        names: &[String],
-        env: &mut dyn VecEnv,
-        seed: u64,
-        prior: Option<Quality>,
-    ) -> Result<Option<(Round, Vec<usize>)>> {
+    fn round(&self, names: &[String], env: &mut dyn VecEnv, seed: u64, prior: Option<Quality>) -> Result<Option<(Round, Vec<usize>)>> {
         let (mut entries, mut tried) = (Vec::new(), Vec::new());
         for name in names {
             if self.stop.load(Ordering::SeqCst) {

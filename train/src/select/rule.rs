@@ -138,7 +138,9 @@ mod tests {
         let verdict = judge(&table, &SelectConfig::default(), PRIOR);
         assert_eq!((verdict.ranking, verdict.reasons[0].len()), (vec![0], 0));
         let all = verdict.reasons[1].join("; ");
-        for word in ["return 5.000 is below 9.800", "success 0.500 is below the best's 0.950 (epoch 1)", "||VP|| 9.00 is above the prior's 5.00"] {
+        for word in
+            ["return 5.000 is below 9.800", "success 0.500 is below the best's 0.950 (epoch 1)", "||VP|| 9.00 is above the prior's 5.00"]
+        {
             assert!(all.contains(word), "{all}");
         }
     }

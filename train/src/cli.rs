@@ -10,6 +10,7 @@ use crate::seeds::Seeds;
 use crate::select::select;
 use crate::stages::Scheme;
 use crate::start::{initial, policy_spec};
+use crate::sweep::{Folder, Manifest, Standing, Sweep};
 use crate::trainer::{Outcome, Trainer, export};
 use crate::{Error, Result};
 use clap::{Parser, Subcommand};
@@ -18,7 +19,7 @@ use egogen::agent::bundle::Bundle;
 use egogen::io::write_atomic;
 use egogen::kernels::keep_memory;
 use std::fs::DirEntry;
-use std::num::NonZeroU64;
+use std::num::{NonZeroU64, NonZeroUsize};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -40,6 +41,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
   train paper --dry-run                   show what would be done, and how long it would take
   train crowded --set stages.pretrain.run.epochs=9   a recipe of stages, with a changed value of one of them
   train report runs/mine                  one page with curves, reward terms, selection and pictures
+  train sweep sweep.toml --out runs/sweep --jobs 2   many settings and seeds of a recipe, and a table
   train select runs/mine                  choose among a run's checkpoints by return, success, pose and KL
 
 Exit codes: 0 done, 1 failed while running, 2 bad usage or recipe, 130 interrupted (after saving)."
@@ -75,6 +77,12 @@ struct Args {
     /// Start from the weights of this policy bundle; its network must be the recipe's
     #[arg(long, value_name = "POLICY_DIR", conflicts_with_all = ["resume", "list"])]
     init: Option<PathBuf>,
+    /// Do one task of this manifest, which `train sweep` has written: nothing where it is done, the rest where it was begun
+    #[arg(long, value_name = "MANIFEST", requires = "index", conflicts_with_all = ["recipe", "out", "seed", "seeds", "list", "set", "resume", "init", "dry_run"])]
+    task: Option<PathBuf>,
+    /// Which task, from 0
+    #[arg(long, value_name = "N", requires = "task")]
+    index: Option<usize>,
     /// Threads to use; results do not depend on it [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -93,6 +101,23 @@ enum Command {
         /// Threads to use; results do not depend on it [default: all cores]
         #[arg(long)]
         threads: Option<usize>,
+    },
+    /// Train many settings and seeds of a recipe; the same command again goes on where it stopped
+    Sweep {
+        /// The sweep, a TOML file
+        file: PathBuf,
+        /// Its folder
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+        /// Tasks at a time, each in a process of its own
+        #[arg(long, value_name = "N", default_value = "1")]
+        jobs: NonZeroUsize,
+        /// Threads of each task
+        #[arg(long, value_name = "N", default_value = "1")]
+        threads: NonZeroUsize,
+        /// Train nothing: write the manifest of tasks (of the next rung, once the one before is done) and the table of what is done
+        #[arg(long)]
+        plan: bool,
     },
     /// Write one HTML page on one or several runs: curves, reward terms, losses, time, stages, selection, and the chosen policy at work
     Report {
@@ -130,11 +155,16 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
             start_threads(*threads)?;
             return choose(dir, set, registry);
         }
+        Some(Command::Sweep { file, out, jobs, threads, plan }) => return sweep(file, out, [jobs.get(), threads.get()], *plan),
         Some(Command::Report { runs, films, out, threads }) => {
             start_threads(*threads)?;
             return report(runs, *films, out.as_deref(), registry);
         }
         None => {}
+    }
+    if let (Some(path), Some(index)) = (&args.task, args.index) {
+        let (manifest, threads, stop) = (Manifest::read(path)?, start_threads(args.threads)?, watch()?);
+        return Ok(code(manifest.run(index, registry, threads, &stop)?));
     }
     if args.list {
         for (name, text) in EMBEDDED {
@@ -170,6 +200,29 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
     };
     let job = Job { scheme: &scheme, registry, dir: &dir, threads, init: init.as_ref() };
     Ok(code(job.run(args.resume.is_some(), &stop, &|_| Ok(()))?))
+}
+
+/// Does what is left of the sweep in `file`, or only plans and sums it up.
+fn sweep(file: &Path, dir: &Path, [jobs, threads]: [usize; 2], plan: bool) -> Result<u8> {
+    let sweep = Sweep::read(file)?;
+    let folder = Folder { sweep: &sweep, dir };
+    let stop = watch()?;
+    let standing = if plan { None } else { Some(folder.run(jobs, threads, &stop)?) };
+    for manifest in folder.manifests()? {
+        eprintln!("{}: {} tasks", manifest.path.display(), manifest.tasks.len());
+    }
+    print!("{}", folder.sum_up()?);
+    match standing {
+        Some(Standing::Finished { failed }) if failed > 0 => Err(Error::run(format!(
+            "{failed} tasks failed, see {}; the same command again tries them again",
+            dir.join("sweep.html").display()
+        ))),
+        Some(Standing::Interrupted) => {
+            eprintln!("interrupted; the same command again goes on");
+            Ok(INTERRUPTED)
+        }
+        _ => Ok(0),
+    }
 }
 
 /// Writes the report on the runs in these folders.

@@ -1,8 +1,10 @@
 //! What changes or ends a run by its own figures: curricula, and rules of convergence.
 
-use crate::recipe::{Recipe, put};
+use crate::recipe::{Recipe, RunConfig, put};
+use crate::registry::{Purpose, Registry};
 use crate::stats::Row;
 use crate::{Error, Result};
+use egogen_envs::{EnvSpec, VecEnv};
 use serde::{Deserialize, Serialize};
 
 /// What a figure of metrics.csv has to do.
@@ -175,6 +177,32 @@ pub fn options(recipe: &Recipe, levels: &[usize]) -> Result<toml::Table> {
 pub fn columns(recipe: &Recipe, levels: &[usize]) -> Row {
     let levels = levels.iter().copied().chain(std::iter::repeat(0));
     recipe.curriculum.iter().zip(levels).map(|(c, level)| (format!("curriculum/{}", c.key), Some(level as f64 + 1.0))).collect()
+}
+
+/// The environments for training at these levels of the curricula; they must be such as tests have.
+pub(crate) fn training_env(recipe: &Recipe, registry: &Registry, levels: &[usize], spec: &EnvSpec) -> Result<Box<dyn VecEnv>> {
+    let made = registry.make(&recipe.env, &options(recipe, levels)?, recipe.run.envs, Purpose::Train)?;
+    let own = made.env.spec();
+    if (&own.obs, own.action) == (&spec.obs, spec.action) {
+        return Ok(made.env);
+    }
+    let keys: Vec<&str> = recipe.curriculum.iter().map(|c| c.key.as_str()).collect();
+    let what = "changes what is observed or what an action is, which must stay as it is";
+    Err(Error::config(format!("recipe '{}': a curriculum of {} {what}", recipe.name, keys.join(", "))))
+}
+
+/// Makes an environment with every value of every curriculum, so that a wrong one is told at the start.
+pub(crate) fn check_levels(recipe: &Recipe, registry: &Registry, spec: &EnvSpec) -> Result<()> {
+    let one = Recipe { run: RunConfig { envs: 1, ..recipe.run }, ..recipe.clone() };
+    for (i, entry) in recipe.curriculum.iter().enumerate() {
+        for value in 0..entry.values.len() {
+            let mut levels = last_levels(recipe);
+            levels[i] = value;
+            let named = |e| Error::config(format!("recipe '{}': curriculum of '{}', value {}: {e}", recipe.name, entry.key, value + 1));
+            training_env(&one, registry, &levels, spec).map_err(named)?;
+        }
+    }
+    Ok(())
 }
 
 #[cfg(test)]

@@ -33,6 +33,7 @@ mod shards;
 pub mod stages;
 mod start;
 pub mod stats;
+pub mod sweep;
 pub mod tensorboard;
 pub mod trainer;
 

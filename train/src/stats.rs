@@ -37,6 +37,17 @@ pub fn bootstrap_interval(strata: &[Vec<f64>], resamples: usize, rng: &mut Strea
     })
 }
 
+/// Standard normal quantile of a two-sided 95 % interval.
+const Z: f64 = 1.96;
+
+/// Mean, and half its 95 % interval by the normal, which is 0 for one value; none without values.
+pub fn mean_and_half(values: &[f64]) -> Option<[f64; 2]> {
+    let n = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    let square = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
+    (!values.is_empty()).then(|| [mean, Z * (square / n).sqrt()])
+}
+
 /// Named figures in the order of the columns; `None` where an epoch has none.
 pub type Row = Vec<(String, Option<f64>)>;
 
@@ -178,5 +189,9 @@ mod tests {
         assert_eq!(inter_quartile_mean(&[9.0, 100.0, 1.0, 3.0, -50.0]), 13.0 / 3.0);
         assert_eq!(inter_quartile_mean(&[1.0, 2.0, 6.0]), 3.0);
         assert_eq!(bootstrap_interval(&[vec![4.0]], 10, &mut stream(0, "test", 0)), [4.0, 4.0]);
+        assert_eq!((mean_and_half(&[]), mean_and_half(&[3.0])), (None, Some([3.0, 0.0])));
+        // Deviations -1, 0, 1: variance 1, standard error 1 / sqrt 3.
+        let [mean, half] = mean_and_half(&[1.0, 2.0, 3.0]).unwrap();
+        assert!(mean == 2.0 && (half - 1.96 / 3f64.sqrt()).abs() < 1e-12);
     }
 }

@@ -3,11 +3,11 @@
 use crate::checkpoint::{self, Best, Checkpoint, Description, State};
 use crate::clock::Clock;
 use crate::collector::{Collector, test_episodes};
-use crate::course::{Course, columns, last_levels, options};
+use crate::course::{Course, check_levels, columns, last_levels, options, training_env};
 use crate::logger::{Console, Csv, Logger};
 use crate::policy::Compute;
 use crate::ppo::{Learner, Progress, Rules};
-use crate::recipe::{Plan, Recipe, RunConfig};
+use crate::recipe::Plan;
 use crate::registry::{Purpose, Registry};
 use crate::select::select;
 use crate::shards::Shards;
@@ -390,32 +390,6 @@ impl<'a> Trainer<'a> {
         write_atomic(self.dir.join("summary.json"), text.as_bytes())?;
         Ok(Outcome::Finished)
     }
-}
-
-/// The environments for training at these levels of the curricula; they must be such as tests have.
-fn training_env(recipe: &Recipe, registry: &Registry, levels: &[usize], spec: &EnvSpec) -> Result<Box<dyn VecEnv>> {
-    let made = registry.make(&recipe.env, &options(recipe, levels)?, recipe.run.envs, Purpose::Train)?;
-    let own = made.env.spec();
-    if (&own.obs, own.action) == (&spec.obs, spec.action) {
-        return Ok(made.env);
-    }
-    let keys: Vec<&str> = recipe.curriculum.iter().map(|c| c.key.as_str()).collect();
-    let what = "changes what is observed or what an action is, which must stay as it is";
-    Err(Error::config(format!("recipe '{}': a curriculum of {} {what}", recipe.name, keys.join(", "))))
-}
-
-/// Makes an environment with every value of every curriculum, so that a wrong one is told at the start.
-fn check_levels(recipe: &Recipe, registry: &Registry, spec: &EnvSpec) -> Result<()> {
-    let one = Recipe { run: RunConfig { envs: 1, ..recipe.run }, ..recipe.clone() };
-    for (i, entry) in recipe.curriculum.iter().enumerate() {
-        for value in 0..entry.values.len() {
-            let mut levels = last_levels(recipe);
-            levels[i] = value;
-            let named = |e| Error::config(format!("recipe '{}': curriculum of '{}', value {}: {e}", recipe.name, entry.key, value + 1));
-            training_env(&one, registry, &levels, spec).map_err(named)?;
-        }
-    }
-    Ok(())
 }
 
 /// Packs the policy of the checkpoint folder `from` into the bundle folder `to`.

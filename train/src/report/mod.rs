@@ -8,7 +8,7 @@ pub use runs::{Group, Run, Stage};
 use crate::Result;
 use crate::evaluate::Estimate;
 use crate::html::{Cell, Page, Picture};
-use crate::plot::{Marks, Titles, marked_lines};
+use crate::plot::{Marks, Series, Titles, marked_lines};
 use crate::registry::Registry;
 use crate::select::{Entry, Quality, Round, Selection};
 use runs::From;
@@ -70,6 +70,11 @@ pub fn page(groups: &[Group], registry: &Registry, starts: usize, command: &str)
         filmed(&mut page, run, registry, starts)?;
     }
     Ok(page.finish())
+}
+
+/// A column of metrics.csv over epochs, called as the group is: mean over its runs, with intervals.
+pub fn curve_of(group: &Group, column: &str) -> Series {
+    group.curve(&group.name, From::Metrics, column)
 }
 
 fn title_of(run: &Run, stage: &Stage) -> String {
@@ -180,7 +185,7 @@ fn selected(page: &mut Page, selection: &Selection) -> Result<()> {
         let points: Vec<(f64, f64)> = (selection.candidates.entries.iter()).filter_map(|e| Some((e.epoch as f64, of(e)?.value))).collect();
         let Some(&(_, first)) = points.first() else { continue };
         let chosen = points.iter().filter(|p| p.0 == selection.epoch as f64).copied().collect();
-        let series = crate::plot::Series { name: String::new(), points, spread: vec![] };
+        let series = Series { name: String::new(), points, spread: vec![] };
         let marks = Marks { borders: vec![], chosen };
         pictures.push(Picture::Svg(marked_lines(Titles { title, x: "epoch of the candidate", y }, first..first, &[series], &marks)?));
     }

@@ -6,11 +6,9 @@ use crate::plot::{Marks, Series};
 use crate::recipe::{Recipe, of_run};
 use crate::select::Selection;
 use crate::stages::Scheme;
+use crate::stats::mean_and_half;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
-
-/// Standard normal quantile of a two-sided 95 % interval.
-const Z: f64 = 1.96;
 
 /// Runs that differ in their seeds alone.
 pub struct Group {
@@ -56,7 +54,9 @@ impl Group {
         }
         let seed = |name: &str| name.strip_prefix("seed-").and_then(|n| n.parse::<u64>().ok());
         let entries = std::fs::read_dir(dir).map_err(|e| Error::config(format!("{}: {e}", dir.display())))?;
-        let mut seeds: Vec<u64> = entries.flatten().filter_map(|e| seed(e.file_name().to_str()?)).collect();
+        // A run that stopped before it began has no recipe.
+        let begun = entries.flatten().filter(|e| e.path().join("recipe.toml").is_file());
+        let mut seeds: Vec<u64> = begun.filter_map(|e| seed(e.file_name().to_str()?)).collect();
         seeds.sort_unstable();
         if seeds.is_empty() {
             let what = "holds neither recipe.toml nor folders seed-K; expected a run's folder, or one of `train --seeds`";
@@ -88,7 +88,7 @@ impl Group {
         for (k, ends) in self.borders().windows(2).enumerate() {
             for row in 0..(ends[1] - ends[0]) as usize {
                 let values: Vec<f64> = self.runs.iter().filter_map(|r| r.stages.get(k)?.of(from).get(column, row)).collect();
-                if let Some([mean, half]) = mean_of(&values) {
+                if let Some([mean, half]) = mean_and_half(&values) {
                     points.push((ends[0] + row as f64 + 1.0, mean));
                     spread.push(half);
                 }
@@ -159,26 +159,4 @@ impl Stage {
 
 fn name_of(dir: &Path) -> String {
     dir.file_name().map_or_else(|| dir.display().to_string(), |n| n.to_string_lossy().into_owned())
-}
-
-/// Mean, and half its 95 % interval by the normal; that is 0 for one value.
-fn mean_of(values: &[f64]) -> Option<[f64; 2]> {
-    let n = values.len() as f64;
-    let mean = values.iter().sum::<f64>() / n;
-    let square = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
-    (!values.is_empty()).then(|| [mean, Z * (square / n).sqrt()])
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn intervals_by_hand() {
-        assert_eq!(mean_of(&[]), None);
-        assert_eq!(mean_of(&[3.0]), Some([3.0, 0.0]));
-        // Deviations -1, 0, 1: variance 1, standard error 1 / sqrt 3.
-        let [mean, half] = mean_of(&[1.0, 2.0, 3.0]).unwrap();
-        assert!(mean == 2.0 && (half - 1.96 / 3f64.sqrt()).abs() < 1e-12);
-    }
 }

@@ -1,0 +1,172 @@
+//! Sweeps, as a person and as an engine runs them.
+
+mod common;
+
+use common::{assert_same_run, column, program, read, stderr, succeed, train};
+use egogen_train::sweep::{Manifest, State};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Output, Stdio};
+use std::time::{Duration, Instant};
+
+/// The point in epochs so short that most of the time goes into files.
+fn files(dir: &Path, sweep: &str) -> PathBuf {
+    let point = include_str!("../train/recipes/point.toml")
+        .replace(
+            "epochs = 12\nepoch_steps = 16384\nenvs = 64\ncollect_steps = 2048",
+            "epochs = 2\nepoch_steps = 128\nenvs = 8\ncollect_steps = 64",
+        )
+        .replace("batch = 512", "batch = 32")
+        .replace("episodes = 64\nevery = 2", "episodes = 4\nevery = 1")
+        .replace("every = 2\nkeep", "every = 1\nkeep");
+    let (recipe, path) = (dir.join("small.toml"), dir.join("sweep.toml"));
+    fs::write(&recipe, point).unwrap();
+    fs::write(&path, format!("recipe = '{}'\nseeds = [0, 1]\nfigure = 'test_det/return'\n{sweep}", recipe.display())).unwrap();
+    path
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("temporary paths are plain")
+}
+
+fn sweep(file: &Path, out: &Path, more: &[&str]) -> Output {
+    train(&[&["sweep", text(file), "--out", text(out)], more].concat())
+}
+
+fn table(output: &Output) -> Vec<Vec<String>> {
+    let text = String::from_utf8(output.stdout.clone()).unwrap();
+    text.lines().map(|line| line.split(',').map(String::from).collect()).collect()
+}
+
+#[test]
+fn a_grid_is_trained_once_and_tabulated() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let file = files(dir.path(), "[grid]\n'ppo.clip' = [0.1, 0.2]\n'ppo.gamma' = [0.9, 0.95]");
+    let first = sweep(&file, &out, &["--jobs", "2"]);
+    assert_eq!(first.status.code(), Some(0), "{}", stderr(&first));
+    let rows = table(&first);
+    assert_eq!(rows[0].join(","), "setting,rung,epochs,ppo.clip,ppo.gamma,test_det/return,half95,done,tasks");
+    assert_eq!(rows.len(), 5);
+    let means: Vec<f64> = rows[1..].iter().map(|r| r[5].parse().unwrap()).collect();
+    assert!(means.is_sorted_by(|a, b| a >= b) && rows[1..].iter().all(|r| r[7..] == ["2", "2"]), "{rows:?}");
+    // A row is what its two runs came to.
+    let runs = [0, 1].map(|seed| out.join(format!("settings/{:0>3}/seed-{seed}", rows[1][0])));
+    let [a, b] = runs.each_ref().map(|run| *column(run, "test_det/return").last().unwrap());
+    assert!((means[0] - (a + b) / 2.0).abs() < 1e-4, "{rows:?}: {a} and {b}");
+    let page = fs::read_to_string(out.join("sweep.html")).unwrap();
+    assert!(
+        ["4 settings", "ppo.clip", "The first settings over epochs"].iter().all(|w| page.contains(w)) && !page.contains("Failed tasks")
+    );
+    // Again: nothing is trained, and all is the same.
+    let stamp = |run: &Path| fs::metadata(run.join("metrics.csv")).unwrap().modified().unwrap();
+    let before = runs.each_ref().map(|run| stamp(run));
+    let again = sweep(&file, &out, &[]);
+    assert_eq!((again.stdout, runs.each_ref().map(|run| stamp(run))), (first.stdout, before));
+    // Another sweep does not get into its folder.
+    let other = sweep(&files(dir.path(), "[grid]\n'ppo.clip' = [0.3]"), &out, &[]);
+    assert!(other.status.code() == Some(2) && stderr(&other).contains("another sweep"), "{}", stderr(&other));
+}
+
+#[test]
+fn tasks_are_done_by_number_and_go_on_after_a_kill() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let file = files(dir.path(), "[grid]\n'run.epochs' = [2, 80]");
+    let planned = sweep(&file, &out, &["--plan"]);
+    assert_eq!(planned.status.code(), Some(0), "{}", stderr(&planned));
+    assert!(stderr(&planned).contains("4 tasks") && !out.join("settings").exists(), "{}", stderr(&planned));
+    let path = out.join("manifest.jsonl");
+    let manifest = Manifest::read(&path).unwrap();
+    let task = ["--task", text(&path), "--index", "2"];
+    let run = out.join("settings/002/seed-0");
+    let mut child = program(&task).stderr(Stdio::null()).spawn().unwrap();
+    let begun = Instant::now();
+    while !run.join("metrics.csv").exists() {
+        assert!(begun.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    assert_eq!(child.wait().unwrap().code(), None, "killed before its end");
+    assert_eq!(manifest.state(&manifest.tasks[2]), State::Open);
+    succeed(&task);
+    assert!(matches!(manifest.state(&manifest.tasks[2]), State::Done(done) if done.epochs == 80));
+    let (recipe, alone) = (dir.path().join("small.toml"), dir.path().join("alone"));
+    succeed(&[text(&recipe), "--set", "run.epochs=80", "--out", text(&alone)]);
+    assert_same_run(&alone, &run, "epoch-0080");
+    let metrics = read(&run, "metrics.csv");
+    assert!(succeed(&task).contains("is done"));
+    assert_eq!(read(&run, "metrics.csv"), metrics);
+    let beyond = train(&["--task", text(&path), "--index", "4"]);
+    assert!(beyond.status.code() == Some(2) && stderr(&beyond).contains("has 4 tasks"), "{}", stderr(&beyond));
+    let line = fs::read_to_string(&path).unwrap().replacen("epochs = 2", "epochs = 3", 1);
+    fs::write(&path, line).unwrap();
+    let changed = train(&task);
+    assert!(changed.status.code() == Some(2) && stderr(&changed).contains("does not have its hash"), "{}", stderr(&changed));
+}
+
+#[test]
+fn what_fails_is_told_and_the_rest_goes_on() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let file = files(dir.path(), "[grid]\n'checkpoint.best' = ['test_det/return', 'test_det/glory']");
+    for _ in 0..2 {
+        let output = sweep(&file, &out, &[]);
+        let told = stderr(&output);
+        assert!(output.status.code() == Some(1) && told.contains("2 tasks failed") && told.contains("test_det/glory"), "{told}");
+        let rows = table(&output);
+        assert_eq!((rows[1][0].as_str(), rows[1][6].as_str(), rows[2][0].as_str(), rows[2][6].as_str()), ("1", "2", "2", "0"), "{rows:?}");
+    }
+    let page = fs::read_to_string(out.join("sweep.html")).unwrap();
+    assert!(page.contains("Failed tasks") && page.contains("002-seed-1"));
+}
+
+#[test]
+fn halving_trains_the_better_settings_longer() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let random = "[random]\ncount = 3\nkeys = { 'adam.lr' = { log = [1e-4, 1e-2] } }\n[halving]\nepochs = [2, 3, 5]\nkeep = 0.5";
+    let output = sweep(&files(dir.path(), random), &out, &["--jobs", "2"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    let rows = table(&output);
+    let shape: Vec<[&str; 2]> = rows[1..].iter().map(|r| [r[1].as_str(), r[2].as_str()]).collect();
+    assert_eq!(shape, [["3", "5"], ["2", "3"], ["1", "2"]], "{rows:?}");
+    for row in &rows[1..] {
+        let epochs = column(&out.join(format!("settings/{:0>3}/seed-1", row[0])), "env_steps").len();
+        assert_eq!(epochs.to_string(), row[2], "a rung goes on where the one before ended");
+    }
+    let again = sweep(&files(dir.path(), random), &out, &[]);
+    assert_eq!(again.stdout, output.stdout);
+}
+
+/// The scripts for engines, with programs in their place that write down what they are asked and run one task.
+#[cfg(unix)]
+#[test]
+fn engines_get_every_task() {
+    use std::os::unix::fs::PermissionsExt;
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    sweep(&files(dir.path(), ""), &out, &["--plan"]);
+    let bin = dir.path().join("bin");
+    fs::create_dir(&bin).unwrap();
+    let place = |name: &str, script: &str| {
+        fs::write(bin.join(name), format!("#!/bin/sh\n{script}\n")).unwrap();
+        fs::set_permissions(bin.join(name), fs::Permissions::from_mode(0o755)).unwrap();
+    };
+    std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_train"), bin.join("train")).unwrap();
+    // The last two arguments are script and manifest; the last five a shell's command, its words and the manifest.
+    place("sbatch", "echo \"$@\" > sbatch.txt; while [ $# -gt 2 ]; do shift; done; SLURM_ARRAY_TASK_ID=1 exec sh \"$@\"");
+    place("hq", "echo \"$@\" > hq.txt; while [ \"$1\" != -- ]; do shift; done; shift; HQ_TASK_ID=0 exec \"$@\"");
+    let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/examples/sweep");
+    let path = format!("{}:{}", bin.display(), std::env::var("PATH").unwrap());
+    for (script, told, option) in [("slurm.sh", "sbatch.txt", "--partition=long"), ("hyperqueue.sh", "hq.txt", "--crash-limit=5")] {
+        let mut command = std::process::Command::new("sh");
+        let command = command.arg(scripts.join(script)).arg("out/manifest.jsonl").arg(option).env("PATH", &path).current_dir(&dir);
+        let output = command.output().unwrap();
+        assert!(output.status.success(), "{script}: {}", stderr(&output));
+        let asked = fs::read_to_string(dir.path().join(told)).unwrap();
+        assert!(asked.contains("--array=0-1") && asked.contains(option), "{asked}");
+    }
+    let manifest = Manifest::read(&out.join("manifest.jsonl")).unwrap();
+    assert!(manifest.tasks.iter().all(|t| matches!(manifest.state(t), State::Done(_))));
+}

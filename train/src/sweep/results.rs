@@ -1,0 +1,140 @@
+//! What a sweep came to: a table, and a page.
+
+use super::plan::Changes;
+use super::{Folder, Manifest, State};
+use crate::Result;
+use crate::html::{Cell, Page, Picture};
+use crate::plot::{Marks, Titles, marked_lines};
+use crate::report::{Group, curve_of};
+use egogen::io::write_atomic;
+
+/// Settings whose curves the page shows.
+const CURVES: usize = 4;
+
+/// One setting, with what its tasks came to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Setting {
+    pub number: usize,
+    pub changes: Changes,
+    /// Rungs it got to, from 1, and the epochs of its last done task.
+    pub rung: usize,
+    pub epochs: u64,
+    /// Mean of the figure over the seeds that have it, and half its 95 % interval.
+    pub mean: Option<[f64; 2]>,
+    pub done: usize,
+    pub tasks: usize,
+}
+
+/// The settings of a manifest, by the figure, larger first; those without one last.
+pub fn ranked(manifest: &Manifest, figure: &str) -> Vec<Setting> {
+    let mut settings: Vec<Setting> = Vec::new();
+    let mut values: Vec<Vec<f64>> = Vec::new();
+    for task in &manifest.tasks {
+        if settings.last().is_none_or(|s| s.number != task.setting) {
+            let (number, changes) = (task.setting, task.changes.clone());
+            settings.push(Setting { number, changes, rung: 1, epochs: 0, mean: None, done: 0, tasks: 0 });
+            values.push(vec![]);
+        }
+        let (Some(setting), Some(values)) = (settings.last_mut(), values.last_mut()) else { continue };
+        setting.tasks += 1;
+        if let State::Done(done) = manifest.state(task) {
+            setting.done += 1;
+            setting.epochs = setting.epochs.max(done.epochs);
+            values.extend(done.figures.get(figure));
+        }
+    }
+    settings.iter_mut().zip(&values).for_each(|(s, v)| s.mean = crate::stats::mean_and_half(v));
+    settings.sort_by(|a, b| {
+        let value = |s: &Setting| s.mean.map_or(f64::NEG_INFINITY, |m| m[0]);
+        value(b).total_cmp(&value(a)).then(a.number.cmp(&b.number))
+    });
+    settings
+}
+
+impl Folder<'_> {
+    /// Every setting where it got to: those of the last rung first, by the figure.
+    pub fn settings(&self) -> Result<Vec<Setting>> {
+        let mut all: Vec<Setting> = Vec::new();
+        for (rung, manifest) in self.manifests()?.iter().enumerate().rev() {
+            let new: Vec<Setting> =
+                ranked(manifest, &self.sweep.figure).into_iter().filter(|s| all.iter().all(|a| a.number != s.number)).collect();
+            all.extend(new.into_iter().map(|s| Setting { rung: rung + 1, ..s }));
+        }
+        Ok(all)
+    }
+
+    /// Writes `table.csv` and `sweep.html`; gives the table.
+    pub fn sum_up(&self) -> Result<String> {
+        let settings = self.settings()?;
+        let keys: Vec<&String> = settings.first().map_or(vec![], |s| s.changes.keys().collect());
+        let number = |v: Option<f64>| v.map_or(String::new(), |v| format!("{v:.4}"));
+        let mut table = String::from("setting,rung,epochs");
+        keys.iter().for_each(|key| table += &format!(",{key}"));
+        table += &format!(",{},half95,done,tasks\n", self.sweep.figure);
+        for s in &settings {
+            table += &format!("{},{},{}", s.number, s.rung, s.epochs);
+            keys.iter().for_each(|key| table += &format!(",{}", quoted(&s.changes[*key].to_string())));
+            let [mean, half] = [0, 1].map(|k| number(s.mean.map(|m| m[k])));
+            table += &format!(",{mean},{half},{},{}\n", s.done, s.tasks);
+        }
+        write_atomic(self.dir.join("table.csv"), table.as_bytes())?;
+        write_atomic(self.dir.join("sweep.html"), self.page(&settings, &keys)?.as_bytes())?;
+        Ok(table)
+    }
+
+    fn page(&self, settings: &[Setting], keys: &[&String]) -> Result<String> {
+        let figure = &self.sweep.figure;
+        let mut page = Page::new("Sweep");
+        page.text(&format!(
+            "{} settings of the recipe {}, each with {} seeds; by {figure} at the end: mean over seeds, and its 95 % interval (1.96 standard \
+             errors). Where rungs differ, later ones come first.",
+            self.sweep.settings().len(),
+            self.sweep.recipe,
+            self.sweep.seeds.len()
+        ));
+        let heads: Vec<&str> =
+            ["setting"].into_iter().chain(keys.iter().map(|k| k.as_str())).chain([figure.as_str(), "epochs", "rung", "done"]).collect();
+        let row = |s: &Setting| {
+            let mut row: Vec<Cell> = vec![format!("{:03}", s.number).into()];
+            row.extend(keys.iter().map(|key| Cell::from(s.changes[*key].to_string())));
+            row.push(s.mean.map_or("-".into(), |[mean, half]| Cell::from(format!("{mean:.4}")).note(format!("± {half:.4}"))));
+            row.extend([Cell::from(s.epochs.to_string()), s.rung.to_string().into()]);
+            row.push(Cell::verdict(format!("{} of {}", s.done, s.tasks), s.done == s.tasks));
+            row
+        };
+        page.table(&heads, &settings.iter().map(row).collect::<Vec<_>>());
+        self.curves(&mut page, settings)?;
+        let manifests = self.manifests()?;
+        let states = manifests.iter().flat_map(|m| m.tasks.iter().map(|t| (&t.id, m.state(t))));
+        let failed: Vec<Vec<Cell>> = states
+            .filter_map(|(id, s)| if let State::Failed(why) = s { Some(vec![id.as_str().into(), Cell::words(why)]) } else { None })
+            .collect();
+        if !failed.is_empty() {
+            page.section("Failed tasks");
+            page.text("They are tried again when the sweep is run again.");
+            page.table(&["task", "why"], &failed);
+        }
+        Ok(page.finish())
+    }
+
+    /// The figure over epochs of the first settings.
+    fn curves(&self, page: &mut Page, settings: &[Setting]) -> Result<()> {
+        let figure = &self.sweep.figure;
+        let folder = |s: &Setting| self.dir.join(format!("settings/{:03}", s.number));
+        let groups = settings.iter().take(CURVES).filter(|s| s.done > 0).map(|s| Group::read(&folder(s))).collect::<Result<Vec<_>>>()?;
+        let series: Vec<_> = groups.iter().map(|g| curve_of(g, figure)).filter(|s| !s.points.is_empty()).collect();
+        let Some(&(_, first)) = series.first().and_then(|s| s.points.first()) else { return Ok(()) };
+        page.section("The first settings over epochs");
+        let plot = marked_lines(Titles { title: figure, x: "epoch", y: "" }, first..first, &series, &Marks::default())?;
+        page.figures(&[(Picture::Svg(plot), "Mean over seeds; bands are 95 % intervals. More of a setting: train report settings/NNN.")]);
+        Ok(())
+    }
+}
+
+/// A cell of a CSV file.
+fn quoted(text: &str) -> String {
+    match text.contains([',', '"', '\n']) {
+        true => format!("\"{}\"", text.replace('"', "\"\"")),
+        false => text.into(),
+    }
+}

@@ -1,9 +1,10 @@
 //! Plans of scenes: what stands there, where people may walk, and ways.
 
+use super::stage::encode;
 use super::{Image, Rgb, TopView, colour};
 use crate::Result;
 use crate::scene::{Grid, Polygon, TriMesh};
-use glam::{DVec2, Vec2};
+use glam::{DVec2, Vec2, Vec4};
 
 /// Laid over what can be walked on.
 const FREE: Rgb = [120, 190, 130];
@@ -24,10 +25,9 @@ pub struct ScenePlan<'a> {
 impl ScenePlan<'_> {
     /// The plan on an image `width` pixels wide.
     pub fn draw(&self, width: usize) -> Result<Image> {
-        let (low, high) = self.walkable.bounds();
-        let mut view = TopView::new(low.as_vec2() - BORDER, high.as_vec2() + BORDER, width)?;
+        let mut view = TopView::around(self.walkable.exterior().iter().map(|p| p.as_vec2()), BORDER, width)?;
         if let Some(mesh) = self.mesh {
-            let colours: Vec<Rgb> = mesh.materials.iter().map(|m| srgb(m.color)).collect();
+            let colours: Vec<Rgb> = mesh.materials.iter().map(|m| encode(Vec4::from(m.color).truncate())).collect();
             let of = |i: usize| colours.get(usize::from(mesh.material[i])).copied().unwrap_or(colour::STONE);
             view.relief((0..mesh.triangles.len()).map(|i| (mesh.corners(i), of(i))));
         }
@@ -51,11 +51,6 @@ impl ScenePlan<'_> {
     }
 }
 
-/// A linear colour as 8-bit sRGB.
-fn srgb([r, g, b, _]: [f32; 4]) -> Rgb {
-    [r, g, b].map(|c| (255.0 * c.clamp(0.0, 1.0).powf(1.0 / 2.2)).round() as u8)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -72,6 +67,9 @@ mod tests {
         let bare = ScenePlan { mesh: None, ways: &[], ..plan }.draw(320).unwrap();
         let tinted = bare.rgb.as_chunks::<3>().0.iter().filter(|p| p[1] > p[0] && p[1] > p[2]).count();
         assert!(tinted > 10_000, "{tinted}");
-        assert_eq!(srgb([0.0, 1.0, 0.5, 1.0]), [0, 255, 186]);
+        // A corridor along y is no higher than wide.
+        let tall = Polygon::new([(0.0, 0.0), (1.0, 0.0), (1.0, 30.0), (0.0, 30.0)].map(DVec2::from).to_vec(), Vec::new()).unwrap();
+        let image = ScenePlan { mesh: None, walkable: &tall, ways: &[], caption: "" }.draw(320).unwrap();
+        assert!(image.height <= image.width + 60, "{} x {}", image.width, image.height);
     }
 }

@@ -200,7 +200,8 @@ fn linear(colour: Rgb) -> Vec3 {
     Vec3::from(colour.map(|v| (v as f32 / 255.0).powf(2.2)))
 }
 
-fn encode(linear: Vec3) -> Rgb {
+/// A linear colour in eight bits a channel.
+pub(super) fn encode(linear: Vec3) -> Rgb {
     linear.to_array().map(|v| (v.clamp(0.0, 1.0).powf(1.0 / 2.2) * 255.0).round() as u8)
 }
 

@@ -46,6 +46,13 @@ impl Grid {
         Ok(grid)
     }
 
+    /// The same with cells of side `cell`, or as much larger as it takes for about `most` of them to cover the area.
+    pub fn of_polygon_within(polygon: &Polygon, cell: f64, most: f64) -> Result<Self> {
+        let (low, high) = polygon.bounds();
+        let size = high - low;
+        Self::of_polygon(polygon, (size.x * size.y / most).sqrt().max(cell))
+    }
+
     /// Gives all cells whose centres lie within the ring this value.
     pub fn fill(&mut self, ring: &[DVec2], value: bool) {
         let row = |y: f64| (((y - self.lowest.y) / self.cell).floor().max(0.0) as usize).min(self.dims[1]);
@@ -266,6 +273,11 @@ mod tests {
         assert!(grid.centres().all(|p| p.abs().max_element() < 2.05 && p.abs().max_element() > 0.55));
         let at = |x: f64, y: f64| grid.holds(DVec2::new(x, y));
         assert!(at(1.0, 1.0) && !at(0.0, 0.0) && !at(2.2, 0.0) && at(0.0, -1.8));
+        // 10 km of 0.02 m would be 250 thousand million.
+        let far = Polygon::new(ring(5000.0), vec![]).unwrap();
+        let coarse = Grid::of_polygon_within(&far, 0.02, 1e4).unwrap();
+        assert!(coarse.cells.len() < 12_000 && (coarse.area() / 1e8 - 1.0).abs() < 0.03, "{}", coarse.area());
+        assert_eq!(Grid::of_polygon_within(&far, 200.0, 1e4).unwrap().cell, 200.0);
         assert!(Grid::covering(DVec2::ZERO, DVec2::splat(1e6), 0.01, 0.0).is_err());
     }
 }

@@ -5,7 +5,6 @@ use super::{Grid, Polygon, TriMesh};
 use crate::{Error, Result};
 use glam::{DVec2, DVec3};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
 
 /// How the walkable area of a mesh is found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -175,7 +174,7 @@ pub(crate) fn outline(part: &Grid, tolerance: f64) -> Result<Polygon> {
 ///
 /// Large is at least half as large as the largest at one height, within 5 cm.
 pub fn floor_height(mesh: &TriMesh) -> Result<f32> {
-    const BIN: f64 = 0.02;
+    const BAND: f64 = 0.05;
     let flat = |i: usize| {
         let [a, b, c] = mesh.corners(i).map(|v| v.as_dvec3());
         let normal = (b - a).cross(c - a);
@@ -184,35 +183,45 @@ pub fn floor_height(mesh: &TriMesh) -> Result<f32> {
     let all: Vec<(f64, f64)> = (0..mesh.triangles.len()).filter_map(flat).collect();
     let up: Vec<(f64, f64)> = all.iter().copied().filter(|f| f.0 > 0.0).collect();
     let enough = |flats: &[(f64, f64)]| flats.iter().map(|f| f.0.abs()).sum::<f64>() >= MIN_AREA;
-    let flats = if enough(&up) { up } else { all };
+    let mut flats = if enough(&up) { up } else { all };
     if !enough(&flats) {
         return Err(Error::invalid(format!(
             "no floor: the mesh has less than {MIN_AREA} m2 of flat surface; is z up, and are these metres?"
         )));
     }
-    let mut bins: BTreeMap<i64, f64> = BTreeMap::new();
-    flats.iter().for_each(|(area, z)| *bins.entry((z / BIN).floor() as i64).or_default() += area.abs());
-    let around = |bin: i64| bins.range(bin - 2..=bin + 2).map(|(_, a)| a).sum::<f64>();
-    let largest = bins.keys().map(|&b| around(b)).fold(0.0, f64::max);
-    let first = bins.keys().copied().find(|&b| around(b) >= 0.5 * largest).unwrap_or(0);
-    let mid = (first as f64 + 0.5) * BIN;
-    let mut near: Vec<(f64, f64)> = flats.into_iter().filter(|f| (f.1 - mid).abs() <= 2.5 * BIN).collect();
-    near.sort_by(|p, q| p.1.total_cmp(&q.1));
+    flats.sort_by(|p, q| p.1.total_cmp(&q.1));
+    // Of each surface: where the ones end that are at most a band higher, and the area of these.
+    let (mut end, mut area) = (0, 0.0);
+    let bands: Vec<(usize, f64)> = (0..flats.len())
+        .map(|start| {
+            while end < flats.len() && flats[end].1 - flats[start].1 <= BAND {
+                area += flats[end].0.abs();
+                end += 1;
+            }
+            let band = (end, area);
+            area -= flats[start].0.abs();
+            band
+        })
+        .collect();
+    let largest = bands.iter().map(|b| b.1).fold(0.0, f64::max);
+    let first = bands.iter().position(|b| b.1 >= 0.5 * largest).unwrap_or(0);
+    // The fullest of the bands that begin in this one.
+    let start = (first..bands[first].0).reduce(|p, q| if bands[q].1 > bands[p].1 { q } else { p }).unwrap_or(first);
+    let band = &flats[start..bands[start].0];
     // The median by area: a few stray surfaces do not move it.
-    let half = near.iter().map(|f| f.0.abs()).sum::<f64>() / 2.0;
     let mut sum = 0.0;
-    let median = near.iter().find(|f| {
+    let median = band.iter().find(|f| {
         sum += f.0.abs();
-        sum >= half
+        sum >= 0.5 * bands[start].1
     });
-    Ok(median.map_or(mid, |f| f.1) as f32)
+    Ok(median.unwrap_or(&flats[first]).1 as f32)
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::rings::signed_area;
     use super::*;
-    use glam::{Vec2, Vec3};
+    use glam::{Affine3A, Vec2, Vec3};
     use serde_json::Value;
 
     /// A floor of 4 x 4 m with its surface at `z`.
@@ -220,6 +229,14 @@ mod tests {
         let mut mesh = TriMesh::new();
         let (object, grey) = (mesh.add_object("floor"), mesh.add_material("grey", [0.5, 0.5, 0.5, 1.0]));
         mesh.add_box(object, grey, Vec3::new(0.0, 0.0, z - 0.05), Vec3::new(4.0, 4.0, 0.1), 0.0);
+        mesh
+    }
+
+    /// A square of 4 m2 at `z` that faces up.
+    fn sheet(z: f32) -> TriMesh {
+        let mut mesh = TriMesh::new();
+        let (object, grey) = (mesh.add_object("sheet"), mesh.add_material("grey", [0.5; 4]));
+        mesh.add_quad(object, grey, [Vec3::ZERO, Vec3::X * 2.0, Vec3::new(2.0, 2.0, 0.0), Vec3::Y * 2.0].map(|p| p.with_z(z)));
         mesh
     }
 
@@ -257,6 +274,15 @@ mod tests {
         mesh.add_box(0, 0, Vec3::new(0.0, 0.0, -1.2), Vec3::new(3.0, 1.0, 0.1), 0.0);
         mesh.add_box(0, 0, Vec3::new(0.0, 0.0, 0.8), Vec3::new(4.0, 4.0, 0.1), 0.0);
         assert!((floor_height(&mesh).unwrap() + 2.0).abs() < 1e-6);
+        // Wherever it is, also where a float's steps are metres.
+        for z in [-3e20, -70_000.0, -0.013, 1e9, 1e30] {
+            assert_eq!(floor_height(&sheet(z)).unwrap(), z);
+        }
+        // Noise of 1 cm: squares at heights of 0.4 m plus or minus that, and a stray one below.
+        let mut noisy = sheet(0.385);
+        (0..64).for_each(|i| noisy.append(&sheet(0.4 + 0.01 * (i as f32 * 2.4).sin()), Affine3A::IDENTITY));
+        noisy.append(&sheet(0.1), Affine3A::IDENTITY);
+        assert!((floor_height(&noisy).unwrap() - 0.4).abs() < 0.003, "{}", floor_height(&noisy).unwrap());
         let (mut flat, wall) = (TriMesh::new(), Vec3::new(0.0, 0.0, 3.0));
         flat.add_object("sheet");
         flat.add_material("grey", [0.5; 4]);

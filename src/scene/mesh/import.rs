@@ -13,6 +13,8 @@ pub const MAX_TRIANGLES: usize = 10_000_000;
 const NO_AREA: f64 = 1e-12;
 /// Largest extents, metres, between which a mesh is taken to be in metres.
 const METRES: std::ops::RangeInclusive<f32> = 0.05..=200.0;
+/// Extents, metres, beyond which a stated unit is wrong.
+const SCENE: std::ops::RangeInclusive<f32> = 1e-3..=1e4;
 /// Units that are tried when none is given, each with the largest extent in the file's numbers that it is taken for.
 const UNITS: [(f32, &str, f32); 3] = [(1.0, "metres", 20.0), (0.01, "centimetres", 2e3), (0.001, "millimetres", 2e4)];
 
@@ -135,6 +137,10 @@ impl Format {
                 return Err(Error::invalid(format!(
                     "unit = {unit}: expected the metres per unit of the mesh, such as 0.01 for centimetres"
                 )));
+            }
+            if extent > 0.0 && !SCENE.contains(&(extent * unit)) {
+                let what = format!("is {extent} units large, with unit = {unit} {} m; expected 1 mm to 10 km", extent * unit);
+                return Err(Error::file(path, what));
             }
             if !METRES.contains(&(extent * unit)) {
                 warnings.push(format!("with unit = {unit} the mesh is {} m large; is that meant?", extent * unit));

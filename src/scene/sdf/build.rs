@@ -42,9 +42,9 @@ impl Default for SdfOptions {
 impl SdfOptions {
     /// Of a room with this walkable area and the floor at this height: what is 1 m above the one on the other is free space.
     ///
-    /// Errors: an area too large to be laid out in cells.
+    /// Errors: a walkable area that is none.
     pub fn for_floor(walkable: &Polygon, floor: f32) -> Result<Self> {
-        let free = Grid::of_polygon(walkable, 0.5)?.centres().map(|p| p.as_vec2().extend(floor + 1.0)).collect();
+        let free = Grid::of_polygon_within(walkable, 0.5, 2e3)?.centres().map(|p| p.as_vec2().extend(floor + 1.0)).collect();
         Ok(Self { floor: Some(floor), free, ..Self::default() })
     }
 

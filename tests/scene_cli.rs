@@ -2,7 +2,7 @@
 
 use egogen::scene::SceneBundle;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 fn start(args: &[&str]) -> Output {
@@ -19,6 +19,14 @@ fn refused(args: &[&str], word: &str) {
     let output = start(args);
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.code() == Some(2) && message.contains(word), "{args:?}: {word}: {:?} {message}", output.status.code());
+}
+
+/// All that lies in a folder and those below it.
+fn listing(dir: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(dir).unwrap().map(|e| e.unwrap().path());
+    let mut all: Vec<PathBuf> = entries.flat_map(|p| if p.is_dir() { [vec![p.clone()], listing(&p)].concat() } else { vec![p] }).collect();
+    all.sort();
+    all
 }
 
 fn room(out: &str) -> Vec<&str> {
@@ -72,16 +80,56 @@ fn meshes_and_files_become_scenes() {
 
     let out = path("never");
     fs::write(path("wall.obj"), "v 0 0 0\nv 3 0 0\nv 3 3 0\nf 1 2 3\n").unwrap();
-    refused(&["mesh", &path("wall.obj"), "--out", &out], "wall.obj: no floor");
     fs::write(path("full.obj"), floor + &block((-2.6, 2.6), (-2.1, 2.1), (0.0, 1.0), 9)).unwrap();
-    refused(&["mesh", &path("full.obj"), "--floor", "0", "--out", &out], "no walkable area");
     fs::write(path("nan.json"), "[[0, 0], [4, 0], [NaN, 4]]").unwrap();
-    refused(&["import", "--polygon", &path("nan.json"), "--out", &out], "nan.json: is no JSON");
     fs::write(path("bow.wkt"), "POLYGON ((0 0, 4 4, 4 0, 0 2, 0 0))").unwrap();
+    let before = listing(dir.path());
+    refused(&["mesh", &path("wall.obj"), "--out", &out], "wall.obj: no floor");
+    refused(&["mesh", &path("full.obj"), "--floor", "0", "--out", &out], "no walkable area");
+    refused(&["mesh", &path("room.obj"), "--unit", "1e9", "--out", &out], "expected 1 mm to 10 km");
+    refused(&["import", "--polygon", &path("nan.json"), "--out", &out], "nan.json: is no JSON");
     refused(&["import", "--polygon", &path("bow.wkt"), "--out", &out], "crosses or touches itself");
     refused(&["import", "--out", &out], "no walkable area");
+    refused(&["import", "--polygon", &path("area.json"), "--voxel", "0.1", "--out", &out], "--voxel");
+    for option in ["--pairs-count", "--blocked", "--seed"] {
+        let pairs = path("pairs.npy");
+        refused(&["import", "--polygon", &path("area.json"), "--pairs", &pairs, option, "0", "--out", &out], "cannot be used with");
+    }
     refused(&["room", "--difficulty", "7", "--out", &out], "rooms.difficulty");
-    assert!(!Path::new(&out).exists(), "nothing is left behind");
+    refused(&["room", "--voxel", "nan", "--out", &out], "voxel is NaN");
+    // After the pairs, and after everything: a folder that cannot be made.
+    refused(&["room", "--kind", "hall", "--voxel", "0.005", "--pairs-count", "1", "--out", &out], "take a larger voxel");
+    let within_a_file = path("area.json") + "/scene";
+    let output = start(&room(&within_a_file));
+    assert!(output.status.code() == Some(1) && String::from_utf8_lossy(&output.stderr).contains("area.json"));
+    assert_eq!(listing(dir.path()), before, "nothing is left behind");
+}
+
+#[test]
+fn what_is_exported_comes_back() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name).display().to_string();
+    done(&room(&path("room")));
+    let (sdf, pickle, pairs) = (path("sdf.npz"), path("authors.pkl"), path("pairs.npy"));
+    done(&["export", &path("room"), "--sdf", &sdf, "--authors-sdf", &pickle, "--pairs", &pairs]);
+    let whole = SceneBundle::read(Path::new(&path("room"))).unwrap();
+    fs::write(path("area.json"), serde_json::json!(whole.walkable).to_string()).unwrap();
+    for file in [&sdf, &pickle] {
+        done(&["import", "--polygon", &path("area.json"), "--sdf", file, "--pairs", &pairs, "--out", &path("again")]);
+        let again = SceneBundle::read(Path::new(&path("again"))).unwrap();
+        assert_eq!(again.pairs.len(), whole.pairs.len());
+        for (pair, same) in whole.pairs.iter().zip(&again.pairs) {
+            assert_eq!((pair.start, pair.goal, pair.blocked), (same.start, same.goal, same.blocked));
+            // A corner that just keeps the clearance may not after its coordinates were rounded.
+            assert!((pair.way - same.way).abs() < 5e-3, "{} {}", pair.way, same.way);
+            let at = |bundle: &SceneBundle| bundle.sdf.as_ref().unwrap().at(pair.start.extend(1.0));
+            assert!((at(&again) - at(&whole)).abs() < 1e-4);
+        }
+    }
+    done(&["import", "--polygon", &path("area.json"), "--pairs-count", "0", "--out", &path("bare")]);
+    refused(&["export", &path("bare"), "--sdf", &sdf], "has no signed distances");
+    refused(&["export", &path("bare"), "--pairs", &pairs], "has no pairs");
+    refused(&["export", &path("bare")], "required");
 }
 
 #[test]
@@ -103,5 +151,5 @@ fn damaged_bundles_are_refused() {
     fs::create_dir(&thesis).unwrap();
     fs::write(thesis.join("chapter.tex"), "work").unwrap();
     let output = start(&room(thesis.to_str().unwrap()));
-    assert!(output.status.code() == Some(1) && thesis.join("chapter.tex").exists());
+    assert!(output.status.code() == Some(2) && thesis.join("chapter.tex").exists());
 }

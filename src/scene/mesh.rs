@@ -5,7 +5,6 @@ mod import;
 mod obj;
 mod ply;
 
-#[cfg(test)]
 pub(crate) use import::Format;
 pub use import::{Imported, MAX_TRIANGLES, MeshOptions, Up, read_mesh};
 

@@ -22,7 +22,12 @@ type Rings = Vec<Vec<DVec2>>;
 ///
 /// Errors: unknown forms, numbers that are not finite, rings that cross themselves.
 pub fn read_polygon(path: &Path) -> Result<Polygon> {
-    let text = fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+    parse_polygon(path, &fs::read(path).map_err(|e| Error::io(path, e))?)
+}
+
+/// [`read_polygon`] of a file's content; `path` names it in errors.
+pub(crate) fn parse_polygon(path: &Path, bytes: &[u8]) -> Result<Polygon> {
+    let text = std::str::from_utf8(bytes).map_err(|e| Error::file(path, format!("is no text: {e}")))?;
     let text = text.trim_start_matches('\u{feff}').trim();
     let polygons = match text.starts_with(['[', '{']) {
         true => serde_json::from_str::<Value>(text).map_err(|e| format!("is no JSON: {e}")).and_then(|v| from_json(&v)),

@@ -110,8 +110,12 @@ impl Pair {
 
 /// Reads starts and goals: NumPy's `.npy`, or a Python pickle of arrays or lists, of shape (n, 2, 2) or (n, 2, 3); heights are left out.
 pub fn read_pairs(path: &Path) -> Result<Vec<[Vec2; 2]>> {
-    let bytes = fs::read(path).map_err(|e| Error::io(path, e))?;
-    let array = if bytes.starts_with(&[0x80]) { nested(path, &bytes)? } else { read_npy(path, &bytes)? };
+    parse_pairs(path, &fs::read(path).map_err(|e| Error::io(path, e))?)
+}
+
+/// [`read_pairs`] of a file's content; `path` names it in errors.
+pub(crate) fn parse_pairs(path: &Path, bytes: &[u8]) -> Result<Vec<[Vec2; 2]>> {
+    let array = if bytes.starts_with(&[0x80]) { nested(path, bytes)? } else { read_npy(path, bytes)? };
     let width = match array.shape[..] {
         [_, 2, width @ (2 | 3)] => width,
         _ => return Err(Error::file(path, format!("has shape {:?}, expected [n, 2, 2] or [n, 2, 3]", array.shape))),

@@ -100,13 +100,6 @@ impl SdfGrid {
         let along_y = |i: usize| lerp(along_z(i, j), along_z(i, j + 1), t.y);
         lerp(along_y(i), along_y(i + 1), t.x)
     }
-
-    /// How the distance grows with x, y and z at `p`: central differences over one voxel. Points away from the nearest obstacle and has
-    /// about unit length, less where two obstacles are equally near.
-    pub fn gradient(&self, p: Vec3) -> Vec3 {
-        let along = |axis: Vec3| self.at(p + axis * (0.5 * self.voxel)) - self.at(p - axis * (0.5 * self.voxel));
-        Vec3::from(Vec3::AXES.map(along)) / self.voxel
-    }
 }
 
 fn lerp(a: f32, b: f32, t: f32) -> f32 {

@@ -66,10 +66,6 @@ fn sphere_by_closed_form() {
     // The mesh lies within 1.5 mm of a sphere of radius 0.6 about (0.3, -0.2, 0.9).
     let worst = each(&grid).map(|(p, v)| (v - ((p - Vec3::new(0.3, -0.2, 0.9)).length() - 0.6)).abs()).fold(0.0, f32::max);
     assert!(worst < 1.5e-3, "{worst}");
-    for p in [Vec3::new(0.3, 0.1, 0.9), Vec3::new(0.8, -0.7, 1.3), Vec3::new(-0.4, -0.3, 0.8)] {
-        let away = (p - Vec3::new(0.3, -0.2, 0.9)).normalize();
-        assert!((grid.gradient(p) - away).length() < 0.05, "{} {away}", grid.gradient(p));
-    }
 }
 
 /// Longitudes and latitudes; chords of 64 around are at most 0.6 (1 - cos(pi / 64)) = 0.72 mm off, each way.
@@ -337,7 +333,6 @@ fn interpolation_by_hand() {
     for p in [grid.lowest, grid.highest(), Vec3::new(-0.6, 0.7, 0.33), Vec3::new(-0.3, 0.99, 0.02)] {
         assert!((grid.at(p) - (1.0 + p.dot(Vec3::new(0.5, -0.3, 0.2)))).abs() < 1e-6);
     }
-    assert!((grid.gradient(Vec3::new(-0.6, 0.75, 0.5)) - Vec3::new(0.5, -0.3, 0.2)).length() < 1e-5);
     // 0.4 beyond the lowest corner along x and 0.3 along y, where the value is 1 - 0.5 - 0.15 = 0.35.
     let beyond = grid.at(grid.lowest - Vec3::new(0.4, 0.3, 0.0));
     assert!((beyond - 0.35f32.hypot(0.5)).abs() < 1e-6, "{beyond}");

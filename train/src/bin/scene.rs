@@ -5,15 +5,19 @@ use egogen::io::write_atomic;
 use egogen::render::{Image, ScenePlan, tile};
 use egogen::scene::{
     Grid, MakeOptions, MeshOptions, Navigator, PICTURE, PairOptions, RoomKind, Rooms, SceneBundle, SceneFiles, Up, WalkableOptions,
+    write_pairs,
 };
-use egogen_train::Result;
 use egogen_train::program::{self, Given};
+use egogen_train::{Error, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 /// Pairs whose ways the picture shows.
 const SHOWN: usize = 5;
+/// Side of the cells by which the walkable area is told, metres, and how many there may be; beyond them cells are larger.
+const CELL: f64 = 0.02;
+const CELLS: f64 = 4e6;
 
 /// Scenes as folders: walkable polygon, mesh, cells, signed distances, pairs of start and goal, and a picture.
 #[derive(Parser)]
@@ -25,6 +29,7 @@ const SHOWN: usize = 5;
   scene mesh scan.ply --out scenes/scan                                       where people can walk in a mesh
   scene import --polygon room0.wkt --sdf room0_sdf.pkl --pairs room0_samples.pkl --out scenes/room0
   scene show scenes/room7                                                     what a bundle holds
+  scene export scenes/room7 --authors-sdf room7_sdf.pkl --pairs room7.npy     for other programs
   scene gallery --out rooms.png                                               twelve rooms in one picture"
 )]
 struct Cli {
@@ -45,6 +50,8 @@ enum Command {
         /// Folder of the bundle
         dir: PathBuf,
     },
+    /// Writes files for other programs from a bundle
+    Export(Export),
     /// Draws rooms of every kind and difficulty side by side
     Gallery {
         /// PNG file
@@ -64,9 +71,6 @@ struct Common {
     /// Folder of the bundle: new, empty, or a bundle to replace
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// Voxels of the signed distances, metres; 0 for none
-    #[arg(long, value_name = "M", default_value_t = MakeOptions::default().voxel)]
-    voxel: f32,
     /// Pairs of start and goal to draw
     #[arg(long, value_name = "N", default_value_t = PairOptions::default().count)]
     pairs_count: usize,
@@ -82,6 +86,13 @@ struct Common {
 }
 
 #[derive(Args)]
+struct Distances {
+    /// Voxels of the signed distances, metres; 0 for none
+    #[arg(long, value_name = "M", default_value_t = MakeOptions::default().voxel)]
+    voxel: f32,
+}
+
+#[derive(Args)]
 struct OfMesh {
     file: PathBuf,
     /// The axis that points up: x, -x, y, -y, z or -z [default: y in glTF and OBJ, z in PLY]
@@ -94,6 +105,8 @@ struct OfMesh {
     #[arg(long, value_name = "M", allow_hyphen_values = true)]
     floor: Option<f32>,
     #[command(flatten)]
+    distances: Distances,
+    #[command(flatten)]
     common: Common,
 }
 
@@ -105,6 +118,8 @@ struct OfRoom {
     #[arg(long, default_value_t = Rooms::default().difficulty)]
     difficulty: f32,
     #[command(flatten)]
+    distances: Distances,
+    #[command(flatten)]
     common: Common,
 }
 
@@ -113,20 +128,35 @@ struct OfFiles {
     /// Walkable polygon: JSON rings, GeoJSON or WKT
     #[arg(long, value_name = "FILE")]
     polygon: Option<PathBuf>,
-    /// Navigation mesh
+    /// Navigation mesh, metres, z up
     #[arg(long, value_name = "FILE")]
     navmesh: Option<PathBuf>,
     /// Signed distances
     #[arg(long, value_name = "FILE")]
     sdf: Option<PathBuf>,
-    /// Starts and goals, (n, 2, 2) or (n, 2, 3)
-    #[arg(long, value_name = "FILE")]
+    /// Starts and goals, (n, 2, 2) or (n, 2, 3); else they are drawn
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["pairs_count", "blocked", "seed"])]
     pairs: Option<PathBuf>,
     /// Height of the floor, metres [default: the navigation mesh's, else 0]
     #[arg(long, value_name = "M", allow_hyphen_values = true)]
     floor: Option<f32>,
     #[command(flatten)]
     common: Common,
+}
+
+#[derive(Args)]
+struct Export {
+    /// Folder of the bundle
+    dir: PathBuf,
+    /// Signed distances as .npz: voxels, their side and the lowest centre
+    #[arg(long, value_name = "FILE")]
+    sdf: Option<PathBuf>,
+    /// Signed distances as the authors' code reads them, .pkl or .npz: a cube, negative in free space
+    #[arg(long, value_name = "FILE")]
+    authors_sdf: Option<PathBuf>,
+    /// Starts and goals as .npy, (n, 2, 2)
+    #[arg(long, value_name = "FILE", required_unless_present_any = ["sdf", "authors_sdf"])]
+    pairs: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -160,26 +190,26 @@ fn run(command: Command) -> Result<u8> {
     match command {
         Command::Mesh(args) => {
             let reading = MeshOptions { up: args.up, unit: args.unit };
-            let options = args.common.options(args.floor);
-            args.common.make(5, |stages| {
-                let (bundle, warnings) = SceneBundle::of_file(&args.file, &reading, &options, stages)?;
-                warnings.iter().for_each(|w| eprintln!("warning: {w}"));
-                Ok(bundle)
-            })
+            let options = args.common.options(args.floor, args.distances.voxel);
+            args.common.make(5, |stages| SceneBundle::of_file(&args.file, &reading, &options, stages))
         }
         Command::Room(args) => {
             let room = Rooms { kind: args.kind.into(), difficulty: args.difficulty }.draw(args.common.seed).given()?;
-            let options = args.common.options(None);
-            args.common.make(4, |stages| SceneBundle::of_room(room, &options, stages))
+            let options = args.common.options(None, args.distances.voxel);
+            args.common.make(3, |stages| Ok((SceneBundle::of_room(room, &options, stages)?, Vec::new())))
         }
         Command::Import(args) => {
             let name = args.common.out.file_name().map_or_else(String::new, |n| n.to_string_lossy().into_owned());
             let files = SceneFiles { polygon: args.polygon, navmesh: args.navmesh, sdf: args.sdf, pairs: args.pairs };
-            let options = args.common.options(args.floor);
-            args.common.make(4, |stages| SceneBundle::of_files(name, &files, &options, stages))
+            let options = args.common.options(args.floor, 0.0);
+            args.common.make(3, |stages| SceneBundle::of_files(name, &files, &options, stages))
         }
         Command::Show { dir } => {
             print!("{}", summary(&SceneBundle::read(&dir).given()?)?);
+            Ok(0)
+        }
+        Command::Export(args) => {
+            export(&args)?;
             Ok(0)
         }
         Command::Gallery { out, seed, width } => {
@@ -191,20 +221,22 @@ fn run(command: Command) -> Result<u8> {
 }
 
 impl Common {
-    fn options(&self, floor: Option<f32>) -> MakeOptions {
+    fn options(&self, floor: Option<f32>, voxel: f32) -> MakeOptions {
         let pairs = PairOptions { count: self.pairs_count, clearance: self.clearance, blocked: self.blocked, ..Default::default() };
-        MakeOptions { walkable: WalkableOptions { floor, ..Default::default() }, voxel: self.voxel, pairs, seed: self.seed }
+        MakeOptions { walkable: WalkableOptions { floor, ..Default::default() }, voxel, pairs, seed: self.seed }
     }
 
-    /// Makes a bundle under a bar over `stages` stages, draws and writes it.
-    fn make(&self, stages: u64, work: impl FnOnce(&mut dyn FnMut(&str)) -> egogen::Result<SceneBundle>) -> Result<u8> {
+    /// Makes a bundle, and warnings, under a bar over `stages` stages, draws and writes it.
+    fn make(&self, stages: u64, work: impl FnOnce(&mut dyn FnMut(&str)) -> egogen::Result<(SceneBundle, Vec<String>)>) -> Result<u8> {
+        SceneBundle::check_target(&self.out).given()?;
         let style = ProgressStyle::with_template("{wide_bar} {pos}/{len} {msg}").unwrap_or(ProgressStyle::default_bar());
         let bar = ProgressBar::new(stages).with_style(style);
         let mut next = |stage: &str| {
             bar.set_message(stage.to_string());
             bar.inc(1);
         };
-        let bundle = work(&mut next).given()?;
+        let (bundle, warnings) = work(&mut next).given()?;
+        warnings.iter().for_each(|w| eprintln!("warning: {w}"));
         next("picture and files");
         bundle.write(&self.out, &picture(&bundle)?.png()?)?;
         bar.finish_and_clear();
@@ -212,6 +244,26 @@ impl Common {
         print!("{}", summary(&bundle)?);
         Ok(0)
     }
+}
+
+/// Writes what is asked for of a bundle, which must have it.
+fn export(args: &Export) -> Result<()> {
+    let bundle = SceneBundle::read(&args.dir).given()?;
+    let lacks = |what: &str| Error::config(format!("{}: the scene has no {what}", args.dir.display()));
+    let sdf = || bundle.sdf.as_ref().ok_or_else(|| lacks("signed distances"));
+    if let Some(path) = &args.sdf {
+        sdf()?.write(path)?;
+    }
+    if let Some(path) = &args.authors_sdf {
+        sdf()?.write_authors(path)?;
+    }
+    if let Some(path) = &args.pairs {
+        if bundle.pairs.is_empty() {
+            return Err(lacks("pairs"));
+        }
+        write_pairs(path, &bundle.pairs)?;
+    }
+    Ok(())
 }
 
 /// The plan of a bundle with the ways of its first pairs.
@@ -227,11 +279,12 @@ fn picture(bundle: &SceneBundle) -> Result<Image> {
 fn summary(bundle: &SceneBundle) -> Result<String> {
     let polygon = &bundle.walkable;
     let (low, high) = polygon.bounds();
-    let area = Grid::of_polygon(polygon, 0.02)?.area();
+    let size = high - low;
+    let area = Grid::of_polygon_within(polygon, CELL, CELLS)?.area();
     let mut lines = vec![
         format!("scene      {}", bundle.name),
         format!("floor      z = {:.3} m", bundle.floor),
-        format!("walkable   {area:.2} m2 within {:.2} x {:.2} m, {} holes", high.x - low.x, high.y - low.y, polygon.holes().len()),
+        format!("walkable   {area:.2} m2 within {:.2} x {:.2} m, {} holes", size.x, size.y, polygon.holes().len()),
     ];
     if let Some(mesh) = &bundle.mesh {
         lines.push(format!(
@@ -264,14 +317,15 @@ fn summary(bundle: &SceneBundle) -> Result<String> {
 /// Eight furnished rooms, two corridors and two halls of rising difficulty.
 fn gallery(seed: u64, width: usize) -> Result<Image> {
     let draw = |k: u64| -> Result<Image> {
+        let seed = seed.wrapping_add(k);
         let kind = match k {
             0..8 => RoomKind::Furnished,
             8 | 9 => RoomKind::Corridor,
             _ => RoomKind::Hall,
         };
-        let room = Rooms { kind, difficulty: (k % 4) as f32 / 3.0 }.draw(seed + k)?;
+        let room = Rooms { kind, difficulty: (k % 4) as f32 / 3.0 }.draw(seed)?;
         let navigator = Navigator::new(&room.walkable, PairOptions::default().clearance.into())?;
-        let pairs = PairOptions { count: 3, blocked: 1.0, ..Default::default() }.draw(&navigator, seed + k)?;
+        let pairs = PairOptions { count: 3, blocked: 1.0, ..Default::default() }.draw(&navigator, seed)?;
         let routes = pairs.iter().filter_map(|p| navigator.route(p.start.as_dvec2(), p.goal.as_dvec2()));
         let ways: Vec<_> = routes.map(|r| r.points).collect();
         let plan = ScenePlan { mesh: Some(&room.mesh), walkable: &room.walkable, ways: &ways, caption: &room.name };

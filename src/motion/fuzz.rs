@@ -20,23 +20,23 @@ use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 use std::path::Path;
 
-fn fixture(name: &str) -> Vec<u8> {
+pub(crate) fn fixture(name: &str) -> Vec<u8> {
     std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures").join(name)).unwrap()
 }
 
 /// The same 256 cases every time; `EGOGEN_FUZZ=20000` tries that many new ones.
-fn config() -> ProptestConfig {
+pub(crate) fn config() -> ProptestConfig {
     let wanted = std::env::var("EGOGEN_FUZZ").ok().and_then(|n| n.parse().ok());
     let rng_seed = if wanted.is_some() { RngSeed::Random } else { RngSeed::Fixed(1) };
     ProptestConfig { cases: wanted.unwrap_or(256), rng_seed, failure_persistence: None, ..ProptestConfig::default() }
 }
 
 /// Up to six changes, each of one byte, a cut or a doubled stretch, at a part (0..1) of the file.
-fn damage() -> impl Strategy<Value = Vec<(f64, u8, u8)>> {
+pub(crate) fn damage() -> impl Strategy<Value = Vec<(f64, u8, u8)>> {
     prop::collection::vec((0.0..1.0f64, any::<u8>(), any::<u8>()), 1..6)
 }
 
-fn damaged(mut bytes: Vec<u8>, changes: &[(f64, u8, u8)]) -> Vec<u8> {
+pub(crate) fn damaged(mut bytes: Vec<u8>, changes: &[(f64, u8, u8)]) -> Vec<u8> {
     for &(place, kind, value) in changes {
         let at = (place * bytes.len() as f64) as usize;
         match kind % 8 {

@@ -13,7 +13,7 @@ mod config;
 pub mod dataset;
 pub mod footlock;
 #[cfg(test)]
-mod fuzz;
+pub(crate) mod fuzz;
 pub mod ik;
 mod import;
 mod layers;

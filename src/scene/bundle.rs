@@ -286,12 +286,12 @@ impl Reader {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::scene::{Navigator, PairOptions, RoomKind, Rooms, Walkable, WalkableOptions};
     use serde_json::Value;
 
-    fn bundle() -> SceneBundle {
+    pub fn bundle() -> SceneBundle {
         let room = Rooms { kind: RoomKind::Corridor, difficulty: 0.2 }.draw(5).unwrap();
         let found = Walkable::of_mesh(&room.mesh, &WalkableOptions { cell: 0.1, close: 0.0, ..Default::default() }).unwrap();
         let navigator = Navigator::new(&room.walkable, 0.22).unwrap();

@@ -2,6 +2,8 @@
 
 mod bundle;
 mod crowded;
+#[cfg(test)]
+mod fuzz;
 mod grid;
 mod make;
 pub mod mesh;

@@ -56,11 +56,6 @@ impl Navigator {
         &self.polygon
     }
 
-    /// The distance from borders that ways keep, metres.
-    pub fn clearance(&self) -> f64 {
-        self.clearance
-    }
-
     /// Whether a person can stand at `p`.
     pub fn stands(&self, p: DVec2) -> bool {
         self.polygon.contains(p) && self.edges.along(p, p, |a, b| segments_distance(a, b, p, p) >= self.clearance - SLACK)
@@ -245,7 +240,6 @@ impl Edges {
 mod tests {
     use super::*;
     use crate::rng::stream;
-    use proptest::prelude::*;
     use rand::RngExt;
     use std::f64::consts::FRAC_PI_2;
 
@@ -304,37 +298,75 @@ mod tests {
         assert!(tangents(&square(4.0), true, 0.2).is_empty());
     }
 
-    proptest! {
-        #![proptest_config(ProptestConfig::with_cases(48))]
+    /// An 8 x 8 m floor with six boxes anywhere.
+    fn cluttered(seed: u64) -> Polygon {
+        let rng = &mut stream(seed, "paths", 0);
+        let mut hole = || {
+            let c = DVec2::new(rng.random_range(-3.0..3.0), rng.random_range(-3.0..3.0));
+            let (h, turn) =
+                (DVec2::new(rng.random_range(0.2..0.9), rng.random_range(0.2..0.9)), DVec2::from_angle(rng.random_range(0.0..PI)));
+            square(1.0).into_iter().map(|v| c + turn.rotate(v * h)).collect()
+        };
+        let holes = (0..6).map(|_| hole()).collect();
+        Polygon::new(square(4.0), holes).unwrap()
+    }
 
-        /// Ways keep their distance, are no shorter than straight lines, the same both ways, and obey the triangle inequality.
-        #[test]
-        fn ways_keep_their_distance(seed in 0u64..1000) {
-            let rng = &mut stream(seed, "paths", 0);
-            let holes = (0..6).map(|_| {
-                let c = DVec2::new(rng.random_range(-3.0..3.0), rng.random_range(-3.0..3.0));
-                let (h, turn) = (DVec2::new(rng.random_range(0.2..0.9), rng.random_range(0.2..0.9)), DVec2::from_angle(rng.random_range(0.0..PI)));
-                square(1.0).into_iter().map(|v| c + turn.rotate(v * h)).collect()
-            });
-            let polygon = Polygon::new(square(4.0), holes.collect()).unwrap();
-            let navigator = Navigator::new(&polygon, 0.25).unwrap();
-            let mut point = || (0..1000).map(|_| DVec2::new(rng.random_range(-4.0..4.0), rng.random_range(-4.0..4.0)))
-                .find(|&p| navigator.stands(p)).unwrap();
-            let (a, b, c) = (point(), point(), point());
-            let length = |p, q| navigator.route(p, q).map(|r| r.length);
-            if let Some(route) = navigator.route(a, b) {
-                prop_assert!(route.length >= a.distance(b) - 1e-9);
-                for s in route.points.windows(2) {
-                    for t in 0..=20 {
-                        let p = s[0].lerp(s[1], t as f64 / 20.0);
-                        prop_assert!(polygon.contains(p) && polygon.border_distance(p) >= 0.25 - 2e-5);
-                    }
-                }
-                prop_assert!((length(b, a).unwrap() - route.length).abs() < 1e-9);
-                if let (Some(ac), Some(cb)) = (length(a, c), length(c, b)) {
-                    prop_assert!(route.length <= 1.03 * (ac + cb));
+    /// Lengths of the shortest ways from `start` to all points of a grid of 0.1 m by steps to their eight neighbours, all 5 cm farther
+    /// from borders than `clearance`, so that the steps between keep the clearance; by an outright search.
+    fn by_steps(polygon: &Polygon, clearance: f64, start: DVec2) -> Vec<(DVec2, f64)> {
+        const N: i32 = 81;
+        let point = |i: i32| DVec2::new(f64::from(i % N) - 40.0, f64::from(i / N) - 40.0) * 0.1;
+        let free: Vec<bool> =
+            (0..N * N).map(|i| polygon.contains(point(i)) && polygon.border_distance(point(i)) >= clearance + 0.05).collect();
+        let mut best = vec![f64::INFINITY; free.len()];
+        let first = (0..N * N).min_by(|&i, &j| point(i).distance(start).total_cmp(&point(j).distance(start))).unwrap();
+        best[first as usize] = 0.0;
+        let mut changed = vec![first];
+        while let Some(i) = changed.pop() {
+            let (x, y) = (i % N, i / N);
+            for (dx, dy) in (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (dx, dy))) {
+                let (u, v) = (x + dx, y + dy);
+                let length = best[i as usize] + point(i).distance(point(i + dy * N + dx));
+                if (0..N).contains(&u) && (0..N).contains(&v) && free[(v * N + u) as usize] && length + 1e-9 < best[(v * N + u) as usize] {
+                    best[(v * N + u) as usize] = length;
+                    changed.insert(0, v * N + u);
                 }
             }
         }
+        (0..N * N).filter(|&i| free[i as usize]).map(|i| (point(i), best[i as usize])).collect()
+    }
+
+    #[test]
+    fn ways_are_found_keep_their_distance_and_are_short() {
+        let (mut found, mut bent) = (0, 0);
+        for seed in 0..12 {
+            let polygon = cluttered(seed);
+            let navigator = Navigator::new(&polygon, 0.25).unwrap();
+            let rng = &mut stream(seed, "ways", 0);
+            let reached = by_steps(&polygon, 0.25, DVec2::ZERO);
+            let start = reached[rng.random_range(0..reached.len())].0;
+            let reached = by_steps(&polygon, 0.25, start);
+            for _ in 0..20 {
+                let (goal, steps) = reached[rng.random_range(0..reached.len())];
+                let Some(route) = navigator.route(start, goal) else {
+                    assert_eq!(steps, f64::INFINITY, "{seed}: {start} to {goal}");
+                    continue;
+                };
+                found += 1;
+                bent += usize::from(route.points.len() > 2);
+                // Steps in eight directions are at most 8.3 % too long, and their clearance is 5 cm larger.
+                let straight = start.distance(goal);
+                assert!(route.length >= straight - 1e-9 && route.length <= steps + 1e-3, "{seed}: {} {steps}", route.length);
+                assert_eq!((route.points[0], route.points.last()), (start, Some(&goal)));
+                for s in route.points.windows(2) {
+                    for t in 0..=20 {
+                        let p = s[0].lerp(s[1], t as f64 / 20.0);
+                        assert!(polygon.contains(p) && polygon.border_distance(p) >= 0.25 - 2e-5, "{seed}: {p}");
+                    }
+                }
+                assert!((navigator.route(goal, start).unwrap().length - route.length).abs() < 1e-9);
+            }
+        }
+        assert!(found > 150 && bent > 50, "{found} {bent}");
     }
 }

@@ -3,6 +3,7 @@
 mod extra;
 mod frame;
 mod model;
+mod parts;
 pub mod rotation;
 mod shaped;
 pub(crate) mod smplx;
@@ -11,7 +12,7 @@ mod surface;
 pub use frame::{Frame, canonical_frame};
 pub use model::BodyModel;
 pub use shaped::{Posed, ShapedBody, local_rotations};
-pub use surface::{Inside, Points, ShapedSurface, Surface};
+pub use surface::{Inside, Moving, Obstacles, Points, ShapedSurface, Surface};
 
 use crate::{Error, Result};
 use std::ops::Range;

@@ -1,8 +1,9 @@
 //! Points of a body's surface at which penetration is measured, in clusters that can be passed over together.
 
 use super::extra::correct;
-use super::{BODY_JOINTS, BodyModel, Frame, Posed, ShapedBody};
-use glam::{Mat3, Vec3};
+use super::parts::Part;
+use super::{BODY_JOINTS, BodyModel, Frame, JOINTS, PARAMS, Posed, ShapedBody};
+use glam::{Affine3A, Vec3, Vec3A};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -14,7 +15,9 @@ const SMPLX_REST: f32 = 10475.0 - SMPLX_HEAD - SMPLX_HANDS - 502.0;
 /// Vertices of SMPL-X itself, each of which counts once.
 const SMPLX: usize = 10475;
 /// Most points of a cluster.
-const CLUSTER: usize = 24;
+const CLUSTER: usize = 12;
+/// Frames in which parts are passed over together.
+const BLOCK: usize = 5;
 /// How far pose correctives may move a point, metres.
 const CORRECTIVE: f32 = 0.06;
 
@@ -39,15 +42,22 @@ pub struct Surface {
     clusters: Vec<Range<usize>>,
     /// Bones that move each cluster.
     bones: Vec<Vec<usize>>,
+    /// Bones of each point and their weights, where those of point i end at `ends[i]`.
+    skin: Vec<(u32, f32)>,
+    ends: Vec<usize>,
+    /// Body parts with their clusters.
+    parts: Vec<(Part, Range<usize>)>,
 }
 
 /// A [`Surface`] at rest on a body of one shape.
 #[derive(Clone)]
 pub struct ShapedSurface {
     surface: Arc<Surface>,
-    rest: Vec<Vec3>,
+    rest: Vec<Vec3A>,
     /// Balls that hold the clusters at rest.
-    balls: Vec<(Vec3, f32)>,
+    balls: Vec<(Vec3A, f32)>,
+    /// Radii of the balls that hold the parts in every pose.
+    reach: Vec<f32>,
 }
 
 /// What of a body lies inside obstacles in one frame, in vertices of SMPL-X.
@@ -61,26 +71,30 @@ pub struct Inside {
 
 impl Surface {
     /// The points of `model`.
-    pub fn new(model: &Arc<BodyModel>, points: Points) -> Self {
+    pub fn new(model: &Arc<BodyModel>, which: Points) -> Self {
         let weights = weights(model);
-        let mut rest = Vec::new();
-        model.rest_vertices(&[0.0; super::BETAS], &mut rest);
+        let (mut rest, mean) = (Vec::new(), model.shape(&[0.0; super::BETAS]));
+        model.rest_vertices(mean.betas(), &mut rest);
+        let joints: Vec<Vec3> = mean.rest_bones().collect();
         let area = vertex_areas(model, &rest);
         let total: f32 = weights.iter().zip(&area).filter(|(w, _)| **w > 0.0).map(|(_, a)| a).sum();
-        let mut surface = Self { model: model.clone(), points: Vec::new(), clusters: Vec::new(), bones: Vec::new() };
+        let (points, clusters, bones, skin, ends, parts) = Default::default();
+        let mut surface = Self { model: model.clone(), points, clusters, bones, skin, ends, parts };
         for part in 0..=u8::MAX {
             let vertices: Vec<usize> = (0..rest.len()).filter(|&v| model.part()[v] == part && weights[v] > 0.0).collect();
             if vertices.is_empty() {
                 continue;
             }
-            let chosen = match points {
+            let chosen = match which {
                 Points::All => vertices.iter().map(|&v| (v, weights[v])).collect(),
                 Points::Spread(n) => {
                     let share: f32 = vertices.iter().map(|&v| area[v]).sum::<f32>() / total;
                     spread(&vertices, ((share * n as f32).round() as usize).max(1), &rest, &weights)
                 }
             };
+            let first = surface.clusters.len();
             surface.cluster(chosen, &rest);
+            surface.parts.push((Part::new(model, usize::from(part), &vertices, &rest, &joints), first..surface.clusters.len()));
         }
         surface
     }
@@ -96,16 +110,22 @@ impl Surface {
     }
 
     /// The points on a body of this shape.
-    pub fn shape(self: &Arc<Self>, betas: &[f32]) -> ShapedSurface {
-        let rest: Vec<Vec3> = self.points.iter().map(|&(v, _)| self.model.rest_vertex(v, betas)).collect();
+    pub fn shape(self: &Arc<Self>, body: &ShapedBody) -> ShapedSurface {
+        let rest: Vec<Vec3A> = self.points.iter().map(|&(v, _)| self.model.rest_vertex(v, body.betas()).into()).collect();
         let slack = if self.model.extra.is_some() { CORRECTIVE } else { 0.0 };
         let ball = |range: &Range<usize>| {
             let points = &rest[range.clone()];
-            let centre = points.iter().sum::<Vec3>() / points.len() as f32;
+            let centre = points.iter().sum::<Vec3A>() / points.len() as f32;
             (centre, slack + points.iter().map(|p| p.distance(centre)).fold(0.0, f32::max))
         };
         let balls = self.clusters.iter().map(ball).collect();
-        ShapedSurface { surface: self.clone(), rest, balls }
+        let joints: Vec<Vec3> = body.rest_bones().collect();
+        let radius = |(part, clusters): &(Part, Range<usize>)| {
+            let points = self.clusters[clusters.clone()].iter().flat_map(Range::clone).map(|i| (self.points[i].0, rest[i].into()));
+            slack + part.radius(&self.model, points, &joints)
+        };
+        let reach = self.parts.iter().map(radius).collect();
+        ShapedSurface { surface: self.clone(), rest, balls, reach }
     }
 
     /// Cuts `points` in two along their longest side until each piece is a cluster.
@@ -115,7 +135,11 @@ impl Surface {
             let mut bones: Vec<usize> = points.iter().flat_map(|p| self.model.skin.of(p.0)).filter(|e| e.1 > 0.0).map(|e| e.0).collect();
             bones.sort_unstable();
             bones.dedup();
-            self.points.extend(points);
+            for (vertex, weight) in points {
+                self.points.push((vertex, weight));
+                self.skin.extend(self.model.skin.of(vertex).iter().filter(|e| e.1 > 0.0).map(|&(k, w)| (k as u32, w)));
+                self.ends.push(self.skin.len());
+            }
             self.clusters.push(first..self.points.len());
             self.bones.push(bones);
             return;
@@ -129,43 +153,110 @@ impl Surface {
     }
 }
 
+/// What a body may be inside of; points are in the world, metres.
+pub trait Obstacles {
+    /// No more than the distance from `p` to the nearest point inside.
+    fn clear(&self, p: Vec3A) -> f32;
+
+    /// How far inside `p` is; 0 outside.
+    fn depth(&self, p: Vec3A) -> f32;
+}
+
+/// A body's motion: T frames.
+#[derive(Clone, Copy, Debug)]
+pub struct Moving<'a> {
+    pub body: &'a ShapedBody,
+    /// T x 93 parameters.
+    pub params: &'a [f32],
+    /// T x 24 x 3 joints of these, metres.
+    pub joints: &'a [f32],
+    /// From their frame to the world.
+    pub to_world: &'a Frame,
+}
+
 impl ShapedSurface {
-    /// What lies inside, that is at a negative `distance` (metres, of a point in the world), of `body` as `posed` in the frame `to_world`.
+    /// What lies inside in each frame of a motion of the body of this shape.
+    ///
+    /// Where the distance at the middle of a ball is greater than its radius, nothing in it is inside. Such balls hold a body part over some
+    /// frames, then in one frame, for which the joints suffice; then, of a posed body, a cluster.
+    pub fn over(&self, motion: &Moving, obstacles: &impl Obstacles) -> Vec<Inside> {
+        let joints: Vec<[Vec3; JOINTS]> = motion.joints.chunks_exact(3 * JOINTS).map(as_points).collect();
+        let params: Vec<&[f32]> = motion.params.chunks_exact(PARAMS).collect();
+        let (mut near, mut touched, mut bones) = (Vec::new(), Vec::new(), Vec::new());
+        let mut out = Vec::with_capacity(params.len());
+        for (joints, params) in joints.chunks(BLOCK).zip(params.chunks(BLOCK)) {
+            near.clear();
+            near.extend((0..self.reach.len()).filter(|&p| self.comes_near(p, joints, motion.to_world, obstacles)));
+            for (joints, params) in joints.iter().zip(params) {
+                touched.clear();
+                touched
+                    .extend(near.iter().copied().filter(|&p| self.comes_near(p, std::slice::from_ref(joints), motion.to_world, obstacles)));
+                let mut inside = Inside::default();
+                if !touched.is_empty() {
+                    let posed = motion.body.pose(params);
+                    place(motion.body, &posed, motion.to_world, &mut bones);
+                    touched.iter().for_each(|&p| self.add_part(p, &posed, &bones, obstacles, &mut inside));
+                }
+                out.push(inside);
+            }
+        }
+        out
+    }
+
+    /// Whether any of part `p` may be inside in one of the frames with these joints.
+    fn comes_near(&self, p: usize, frames: &[[Vec3; JOINTS]], to_world: &Frame, obstacles: &impl Obstacles) -> bool {
+        let middle = |joints: &[Vec3; JOINTS]| self.surface.parts[p].0.middle(joints);
+        let first = middle(&frames[frames.len() / 2]);
+        let apart = frames.iter().map(|f| middle(f).distance(first)).fold(0.0, f32::max);
+        obstacles.clear(to_world.point(first).into()) <= self.reach[p] + apart
+    }
+
+    /// Adds what is inside of part `p`.
     ///
     /// A bone takes a cluster's ball to a ball of the same size, and a skinned point lies between where its bones take it: so all points
-    /// of a cluster lie in the ball round the middle of those, and are passed over where the distance there is greater than its radius
-    /// and `slack` (how much `distance` may be too great, such as a voxel).
-    pub fn inside(&self, body: &ShapedBody, posed: &Posed, to_world: &Frame, slack: f32, distance: impl Fn(Vec3) -> f32) -> Inside {
-        let world = |(rot, pos): (Mat3, Vec3), j: Vec3| (to_world.rot * rot, to_world.point(pos - rot * j));
-        let bones: Vec<(Mat3, Vec3)> = posed.bones().zip(body.rest_bones()).map(|(b, j)| world(b, j)).collect();
-        let mut sum = Inside::default();
-        for ((range, used), (centre, radius)) in self.surface.clusters.iter().zip(&self.surface.bones).zip(&self.balls) {
-            let at = |k: &usize| bones[*k].0 * *centre + bones[*k].1;
-            let middle = used.iter().map(at).sum::<Vec3>() / used.len() as f32;
-            let apart = used.iter().map(|k| at(k).distance(middle)).fold(0.0, f32::max);
-            if distance(middle) > radius + apart + slack {
+    /// of a cluster lie in the ball round the middle of those.
+    fn add_part(&self, p: usize, posed: &Posed, bones: &[Affine3A], obstacles: &impl Obstacles, sum: &mut Inside) {
+        for c in self.surface.parts[p].1.clone() {
+            let (used, (centre, radius)) = (&self.surface.bones[c], &self.balls[c]);
+            let at = |k: &usize| bones[*k].transform_point3a(*centre);
+            let middle = used.iter().map(at).sum::<Vec3A>() / used.len() as f32;
+            let apart = used.iter().map(|k| at(k).distance_squared(middle)).fold(0.0, f32::max).sqrt();
+            if obstacles.clear(middle) > radius + apart {
                 continue;
             }
-            for i in range.clone() {
-                let (vertex, weight) = self.surface.points[i];
-                let d = distance(self.skin(i, vertex, posed, &bones));
-                if d < 0.0 {
+            for i in self.surface.clusters[c].clone() {
+                let depth = obstacles.depth(self.skin(i, posed, bones));
+                if depth > 0.0 {
+                    let weight = self.surface.points[i].1;
                     sum.count += weight;
-                    sum.depth -= weight * d;
+                    sum.depth += weight * depth;
                 }
             }
         }
-        sum
     }
 
-    fn skin(&self, i: usize, vertex: usize, posed: &Posed, bones: &[(Mat3, Vec3)]) -> Vec3 {
-        let (model, mut v) = (&self.surface.model, self.rest[i]);
-        if let Some(extra) = &model.extra {
-            let n = extra.columns();
-            v += correct(&extra.correctives[vertex * n..(vertex + 1) * n], &posed.extra.feature);
+    /// Point `i` in the world.
+    fn skin(&self, i: usize, posed: &Posed, bones: &[Affine3A]) -> Vec3A {
+        let (surface, mut v) = (&*self.surface, self.rest[i]);
+        if let Some(extra) = &surface.model.extra {
+            let (n, vertex) = (extra.columns(), surface.points[i].0);
+            v += Vec3A::from(correct(&extra.correctives[vertex * n..(vertex + 1) * n], &posed.extra.feature));
         }
-        model.skin.of(vertex).iter().fold(Vec3::ZERO, |sum, &(k, w)| sum + w * (bones[k].0 * v + bones[k].1))
+        let own = &surface.skin[if i == 0 { 0 } else { surface.ends[i - 1] }..surface.ends[i]];
+        own.iter().fold(Vec3A::ZERO, |sum, &(k, w)| sum + w * bones[k as usize].transform_point3a(v))
     }
+}
+
+/// What the bones of a posed body, joints first, do to points at rest, into `out`.
+fn place(body: &ShapedBody, posed: &Posed, to_world: &Frame, out: &mut Vec<Affine3A>) {
+    let to_world = Affine3A::from_mat3_translation(to_world.rot, to_world.transl);
+    out.clear();
+    out.extend(posed.bones().zip(body.rest_bones()).map(|((rot, pos), j)| to_world * Affine3A::from_mat3_translation(rot, pos - rot * j)));
+}
+
+/// One frame of joints.
+fn as_points(floats: &[f32]) -> [Vec3; JOINTS] {
+    std::array::from_fn(|k| Vec3::from_slice(&floats[3 * k..]))
 }
 
 /// SMPL-X vertices that each vertex stands for; 0 on the feet.
@@ -256,26 +347,87 @@ mod tests {
         }
     }
 
+    /// Obstacles of an exact distance.
+    struct Exact<F>(F);
+
+    impl<F: Fn(Vec3) -> f32> Obstacles for Exact<F> {
+        fn clear(&self, p: Vec3A) -> f32 {
+            self.0(p.into())
+        }
+
+        fn depth(&self, p: Vec3A) -> f32 {
+            -self.0(p.into()).min(0.0)
+        }
+    }
+
+    /// One frame.
+    fn still(surface: &ShapedSurface, body: &ShapedBody, params: &[f32], to_world: &Frame, distance: impl Fn(Vec3) -> f32) -> Inside {
+        let mut joints = [0.0; 3 * JOINTS];
+        body.pose(params).write_joints(&mut joints);
+        surface.over(&Moving { body, params, joints: &joints, to_world }, &Exact(distance))[0]
+    }
+
     #[test]
-    fn passing_over_clusters_changes_nothing() {
+    fn passing_over_parts_and_clusters_changes_nothing() {
         let model = BodyModel::embedded();
         let surface = Arc::new(Surface::new(&model, Points::All));
         let mut touched = 0;
         for k in 0..40u64 {
             let betas = [0.5 * ((k % 5) as f32 - 2.0); BETAS];
             let body = model.shape(&betas);
-            let posed = body.pose(&random_params(k));
+            let params = random_params(k);
+            let posed = body.pose(&params);
             let to_world = Frame::planar(0.3 * k as f32, 0.1 * k as f32, -0.2);
             let pelvis = to_world.point(posed.pos[0]);
             let distance = boxed(pelvis + Vec3::new(0.35, 0.05 * k as f32 - 1.0, 0.1), Vec3::new(0.3, 0.4, 0.5));
-            let (got, want) = (
-                surface.shape(&betas).inside(&body, &posed, &to_world, 0.0, &distance),
-                brute(&model, &body, &posed, &to_world, &distance),
-            );
+            let (got, want) =
+                (still(&surface.shape(&body), &body, &params, &to_world, &distance), brute(&model, &body, &posed, &to_world, &distance));
             assert!((got.count - want.count).abs() <= 1e-3 * want.count && (got.depth - want.depth).abs() <= 1e-3 * want.depth + 1e-4);
             touched += usize::from(want.count > 0.0);
         }
         assert!((10..40).contains(&touched), "{touched} of 40 bodies touch the box");
+    }
+
+    #[test]
+    fn a_part_stays_within_its_ball() {
+        let model = BodyModel::embedded();
+        let surface = Arc::new(Surface::new(&model, Points::All));
+        for k in 0..60u64 {
+            let body = model.shape(&[0.5 * ((k % 5) as f32 - 2.0); BETAS]);
+            let (shaped, posed) = (surface.shape(&body), body.pose(&random_params(k)));
+            let mut bones = Vec::new();
+            place(&body, &posed, &Frame::IDENTITY, &mut bones);
+            for ((part, clusters), reach) in surface.parts.iter().zip(&shaped.reach) {
+                let middle = part.middle(&posed.pos);
+                for i in surface.clusters[clusters.clone()].iter().flat_map(Range::clone) {
+                    let far = shaped.skin(i, &posed, &bones).distance(middle.into());
+                    assert!(far <= reach + 1e-4, "a point {far} m from the middle of a ball of {reach} m");
+                }
+            }
+        }
+        let widest = surface.shape(&model.shape(&[0.0; BETAS])).reach.iter().copied().fold(0.0, f32::max);
+        assert!(widest < 0.45, "balls of up to {widest} m leave out little");
+    }
+
+    #[test]
+    fn frames_of_a_motion_are_those_one_by_one() {
+        let model = BodyModel::embedded();
+        let surface = Arc::new(Surface::new(&model, Points::Spread(1000)));
+        let body = model.shape(&[0.0; BETAS]);
+        let shaped = surface.shape(&body);
+        // 23 frames of a figure that slides past a box in different poses.
+        let mut params: Vec<f32> = Vec::new();
+        for t in 0..23 {
+            let mut frame = random_params(t / 4);
+            frame[..3].copy_from_slice(&[0.06 * t as f32 - 0.7, 0.2, 1.0]);
+            params.extend(frame);
+        }
+        let joints: Vec<f32> = params.chunks_exact(PARAMS).flat_map(|p| body.pose(p).pos).flat_map(|p| p.to_array()).collect();
+        let distance = boxed(Vec3::new(0.9, 0.3, 0.5), Vec3::new(0.4, 0.5, 0.7));
+        let got = shaped.over(&Moving { body: &body, params: &params, joints: &joints, to_world: &Frame::IDENTITY }, &Exact(&distance));
+        let want: Vec<Inside> = params.chunks_exact(PARAMS).map(|p| still(&shaped, &body, p, &Frame::IDENTITY, &distance)).collect();
+        assert_eq!(got, want);
+        assert!(got[0].count == 0.0 && got[22].count > 0.0);
     }
 
     #[test]
@@ -284,9 +436,9 @@ mod tests {
         let model = BodyModel::embedded();
         let surface = Arc::new(Surface::new(&model, Points::All));
         let body = model.shape(&[0.0; BETAS]);
-        let posed = body.pose(&[0.0; crate::body::PARAMS]);
-        let shaped = surface.shape(&[0.0; BETAS]);
-        let inside = |x: f32| shaped.inside(&body, &posed, &Frame::IDENTITY, 0.0, |p| x - p.x);
+        let posed = body.pose(&[0.0; PARAMS]);
+        let shaped = surface.shape(&body);
+        let inside = |x: f32| still(&shaped, &body, &[0.0; PARAMS], &Frame::IDENTITY, |p| x - p.x);
         assert_eq!(inside(3.0), Inside::default());
         // All 9,973, each as deep as it lies right of the plane at -3 m: the body is symmetric, so 3 m on average.
         let all = inside(-3.0);
@@ -303,11 +455,11 @@ mod tests {
         let (all, few) = (Arc::new(Surface::new(&model, Points::All)), Arc::new(Surface::new(&model, Points::Spread(1500))));
         assert!(few.len() < 1600 && all.len() > 5 * few.len());
         let body = model.shape(&[0.0; BETAS]);
-        let (all, few) = (all.shape(&[0.0; BETAS]), few.shape(&[0.0; BETAS]));
+        let (all, few) = (all.shape(&body), few.shape(&body));
         for k in 0..20 {
-            let posed = body.pose(&random_params(100 + k));
-            let at = posed.pos[0].x + 0.04 * k as f32 - 0.3;
-            let inside = |s: &ShapedSurface| s.inside(&body, &posed, &Frame::IDENTITY, 0.0, |p| at - p.x);
+            let params = random_params(100 + k);
+            let at = body.pose(&params).pos[0].x + 0.04 * k as f32 - 0.3;
+            let inside = |s: &ShapedSurface| still(s, &body, &params, &Frame::IDENTITY, |p| at - p.x);
             let (a, b) = (inside(&all), inside(&few));
             assert!((a.count - b.count).abs() < 0.03 * a.count + 30.0, "{a:?} {b:?}");
             assert!((a.depth - b.depth).abs() < 0.03 * a.depth + 1.0, "{a:?} {b:?}");

@@ -1,6 +1,6 @@
 //! Crowded scenes: many rooms, each with what walking and penetration need, made once and kept.
 
-use super::{Navigator, Pair, PairOptions, Room, RoomKind, Rooms, Scene, SdfGrid, SdfOptions, Setting, Split, TriMesh};
+use super::{Depths, Navigator, Pair, PairOptions, Probe, Room, RoomKind, Rooms, Scene, SdfGrid, SdfOptions, Setting, Split, TriMesh};
 use crate::rng::{Stream, stream};
 use crate::{Error, Result};
 use rand::RngExt;
@@ -42,6 +42,7 @@ pub struct CrowdedScene {
     pub scene: Scene,
     pub mesh: TriMesh,
     pub sdf: SdfGrid,
+    depths: Depths,
     pub pairs: Vec<Pair>,
 }
 
@@ -87,7 +88,13 @@ impl CrowdedScene {
         let pairs = pairs.draw(&Navigator::new(&room.walkable, pairs.clearance.into())?, seed)?;
         let layout = SdfOptions { voxel, top: Some(REACH), ..SdfOptions::for_floor(&room.walkable, 0.0)? };
         let sdf = SdfGrid::build(&room.mesh, &layout)?;
-        Ok(Self { name: room.name, scene: Scene { walkable: room.walkable, obstacles: Vec::new() }, mesh: room.mesh, sdf, pairs })
+        let (depths, scene) = (Depths::new(&sdf), Scene { walkable: room.walkable, obstacles: Vec::new() });
+        Ok(Self { name: room.name, scene, mesh: room.mesh, sdf, depths, pairs })
+    }
+
+    /// Look-ups of its distances.
+    pub fn probe(&self) -> Probe<'_> {
+        self.depths.probe(&self.sdf)
     }
 
     /// One of the pairs.

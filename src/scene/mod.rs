@@ -2,6 +2,7 @@
 
 mod bundle;
 mod crowded;
+mod depths;
 #[cfg(test)]
 mod fuzz;
 mod grid;
@@ -19,6 +20,7 @@ mod walkable;
 
 pub use bundle::{PICTURE, SceneBundle};
 pub use crowded::{CrowdedScene, CrowdedScenes};
+pub use depths::{Depths, Probe};
 pub use grid::Grid;
 pub use make::{MakeOptions, SceneFiles, Stages};
 pub use mesh::{Material, MeshOptions, TriMesh, Up, read_mesh};

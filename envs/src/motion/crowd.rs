@@ -1,20 +1,24 @@
 //! People among furniture: which room an episode plays in, and how much of a body lies inside what stands there.
 
 use super::MotionTask;
-use egogen::body::{BETAS, BodyModel, Inside, PARAMS, Points, ShapedSurface, Surface};
+use egogen::body::{BETAS, BodyModel, Frame, Inside, JOINTS, Moving, Obstacles, PARAMS, Points, ShapedBody, ShapedSurface, Surface};
 use egogen::motion::{FRAMES, SEED};
 use egogen::rng::Stream;
-use egogen::scene::{CrowdedScene, Setting, Split};
+use egogen::scene::{CrowdedScene, Probe, Setting, Split};
 use egogen::sim::{People, Primitives, Sim};
 use egogen::{Error, Result};
+use glam::Vec3A;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
 /// Vertices inside that eq. 8's count form divides by.
 const COUNTS: f32 = 10.0;
+/// How much a distance between voxels may be too great, near corners, voxels.
+const SLACK: f32 = 0.5;
 
-/// How penetration is judged in rooms. Defaults are those of pretraining.
+/// How penetration is judged in rooms. Defaults are those of pretraining. Where neither `weights.penetration` nor `most` asks for it,
+/// nobody is measured, which saves time.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Penetration {
@@ -55,6 +59,13 @@ pub struct Presence {
 }
 
 impl Presence {
+    /// Of what lies inside in each frame.
+    pub fn over(frames: &[Inside]) -> Self {
+        let n = frames.len().max(1) as f32;
+        let mean = |of: fn(&Inside) -> f32| frames.iter().map(of).sum::<f32>() / n;
+        Self { count: mean(|f| f.count), depth: mean(|f| f.depth), most: frames.iter().map(|f| f.count).fold(0.0, f32::max) }
+    }
+
     /// Eq. 8.
     pub fn reward(&self, form: Form) -> f32 {
         match form {
@@ -64,24 +75,41 @@ impl Presence {
     }
 }
 
-/// The rooms of a task and the body's surface.
+/// A body of one shape with its surface.
+struct Shaped {
+    body: ShapedBody,
+    surface: ShapedSurface,
+}
+
+/// The rooms of a task and the people in them.
 pub(super) struct Crowd {
     scenes: Arc<Vec<CrowdedScene>>,
+    model: Arc<BodyModel>,
     surface: Arc<Surface>,
-    /// The surface on the mean shape, which most people have.
-    mean: ShapedSurface,
-    body: Arc<BodyModel>,
+    /// Of each environment's person.
+    shapes: Vec<Arc<Shaped>>,
+    /// Whether penetration counts; if not, nobody is measured.
+    counts: bool,
 }
 
 impl Crowd {
-    /// None where the task has no rooms.
-    pub fn new(task: &MotionTask, sim: &Sim, split: Split) -> Result<Option<Self>> {
+    /// None where the task has no rooms; `n` people.
+    pub fn new(task: &MotionTask, sim: &Sim, n: usize, split: Split) -> Result<Option<Self>> {
         let Some(rooms) = &task.rooms else { return Ok(None) };
         let scenes = rooms.make(split)?;
         let points = if task.penetration.points == 0 { Points::All } else { Points::Spread(task.penetration.points) };
-        let surface = Arc::new(Surface::new(sim.body(), points));
-        let mean = surface.shape(&[0.0; BETAS]);
-        Ok(Some(Self { scenes, surface, mean, body: sim.body().clone() }))
+        let (model, surface) = (sim.body().clone(), Arc::new(Surface::new(sim.body(), points)));
+        let mean = Arc::new(Shaped::new(&model, &surface, &[0.0; BETAS]));
+        let counts = task.weights.penetration != 0.0 || task.penetration.most.is_some();
+        Ok(Some(Self { scenes, model, surface, shapes: vec![mean; n], counts }))
+    }
+
+    /// Takes notice of person `i`'s shape; to be told before anything is asked of a new person.
+    pub fn dress(&mut self, i: usize, people: &People) {
+        let betas = &people.betas[i * BETAS..][..BETAS];
+        if self.shapes[i].body.betas() != betas {
+            self.shapes[i] = Arc::new(Shaped::new(&self.model, &self.surface, betas));
+        }
     }
 
     /// A room, and a start and a goal in it.
@@ -96,40 +124,61 @@ impl Crowd {
     }
 
     /// Person `i`'s primitive in a room.
-    pub fn presence(&self, room: u32, people: &People, prims: &Primitives, i: usize) -> Presence {
-        let params = &prims.params[i * FRAMES * PARAMS..][..FRAMES * PARAMS];
-        self.measure(room, &people.betas[i * BETAS..][..BETAS], params, &prims.frames[i])
+    pub fn presence(&self, room: u32, prims: &Primitives, i: usize) -> Presence {
+        if !self.counts {
+            return Presence::default();
+        }
+        self.measure(room, (&prims.params, &prims.joints, &prims.frames), FRAMES, i)
     }
 
     /// Whether person `i` stands clear of everything in both seed frames.
     pub fn stands_free(&self, room: u32, people: &People, i: usize) -> bool {
-        let params = &people.params[i * SEED * PARAMS..][..SEED * PARAMS];
-        self.measure(room, &people.betas[i * BETAS..][..BETAS], params, &people.frames[i]).most == 0.0
+        self.measure(room, (&people.params, &people.joints, &people.frames), SEED, i).most == 0.0
     }
 
-    fn measure(&self, room: u32, betas: &[f32], params: &[f32], to_world: &egogen::body::Frame) -> Presence {
-        let Some(scene) = self.scenes.get(room as usize) else { return Presence::default() };
-        let own = betas.iter().any(|b| *b != 0.0).then(|| self.surface.shape(betas));
-        let (surface, body) = (own.as_ref().unwrap_or(&self.mean), self.body.shape(betas));
-        let (mut sum, mut frames) = (Presence::default(), 0.0);
-        for frame in params.chunks_exact(PARAMS) {
-            let Inside { count, depth } = surface.inside(&body, &body.pose(frame), to_world, scene.sdf.voxel, |p| scene.sdf.at(p));
-            sum = Presence { count: sum.count + count, depth: sum.depth + depth, most: sum.most.max(count) };
-            frames += 1.0;
-        }
-        Presence { count: sum.count / frames, depth: sum.depth / frames, most: sum.most }
+    /// Of n people's parameters, joints and frames those of person `i`, who has that many frames.
+    fn measure<'a>(&self, room: u32, (params, joints, to_world): (&'a [f32], &'a [f32], &[Frame]), frames: usize, i: usize) -> Presence {
+        let (Some(scene), Shaped { body, surface }) = (self.scenes.get(room as usize), &*self.shapes[i]) else {
+            return Presence::default();
+        };
+        let own = |all: &'a [f32], width: usize| &all[i * frames * width..(i + 1) * frames * width];
+        let motion = Moving { body, params: own(params, PARAMS), joints: own(joints, 3 * JOINTS), to_world: &to_world[i] };
+        let obstacles = Room::new(scene);
+        Presence::over(&surface.over(&motion, &obstacles))
+    }
+}
+
+/// What stands in a room.
+struct Room<'a> {
+    probe: Probe<'a>,
+    /// Metres.
+    slack: f32,
+}
+
+impl<'a> Room<'a> {
+    fn new(scene: &'a CrowdedScene) -> Self {
+        Self { probe: scene.probe(), slack: SLACK * scene.sdf.voxel }
+    }
+}
+
+impl Obstacles for Room<'_> {
+    fn clear(&self, p: Vec3A) -> f32 {
+        self.probe.distance(p) - self.slack
+    }
+
+    #[inline]
+    fn depth(&self, p: Vec3A) -> f32 {
+        self.probe.depth(p)
+    }
+}
+
+impl Shaped {
+    fn new(model: &BodyModel, surface: &Arc<Surface>, betas: &[f32]) -> Self {
+        let body = model.shape(betas);
+        let surface = surface.shape(&body);
+        Self { body, surface }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn equation_8_by_hand() {
-        let p = Presence { count: 20.0, depth: 0.3, most: 50.0 };
-        assert!((p.reward(Form::Depth) - (-0.3f32).exp()).abs() < 1e-7);
-        assert!((p.reward(Form::Count) - (-2.0f32).exp()).abs() < 1e-7);
-        assert_eq!(Presence::default().reward(Form::Depth), 1.0);
-    }
-}
+mod tests;

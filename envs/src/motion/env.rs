@@ -129,7 +129,7 @@ impl MotionEnv {
         let spec = spec(task.latents.unwrap_or(dim));
         let state = State { seed, people: People::new(n), members: vec![Member::default(); n] };
         let judge = PoseJudge::new(&task)?;
-        let crowd = Crowd::new(&task, &sim, if starts == Starts::Fixed { Split::Validation } else { Split::Train })?;
+        let crowd = Crowd::new(&task, &sim, n, if starts == Starts::Fixed { Split::Validation } else { Split::Train })?;
         let mut env = Self { spec, task, own: Vec::new(), starts, sim, bank, judge, crowd, stage, state, prims: Primitives::default() };
         env.restart(seed)?;
         Ok(env)
@@ -229,6 +229,7 @@ impl MotionEnv {
             let yaw = yaw_towards(to.x, to.y) + turn;
             self.state.people.place(i, self.sim.body(), seed, yaw, setting.start.x, setting.start.y)?;
             let people = &self.state.people;
+            self.crowd.iter_mut().for_each(|crowd| crowd.dress(i, people));
             let free = match (&self.crowd, room) {
                 (Some(crowd), Some(room)) => crowd.stands_free(room, people, i),
                 _ => blocked(&self.task, people, i, &setting.scene.walkable) == 0,
@@ -261,7 +262,7 @@ impl MotionEnv {
                 return;
             }
             let natural = judge.as_ref().is_none_or(|j| j.natural(prims, i));
-            let presence = crowd.as_ref().zip(member.room).map(|(crowd, room)| crowd.presence(room, people, prims, i));
+            let presence = crowd.as_ref().zip(member.room).map(|(crowd, room)| crowd.presence(room, prims, i));
             let blocked = if presence.is_some() { 0 } else { blocked(task.0, people, i, &ground(stage, member, i)) };
             let verdict = member.judge(task, &Step { people, prims, person: i, natural, blocked, presence }, terms, episode);
             (*reward, *ended) = (verdict.reward, verdict.ended);
@@ -346,6 +347,7 @@ impl VecEnv for MotionEnv {
             return Err(bad(format!("environment {i} of it plays in {room}")));
         }
         self.state = state;
+        self.crowd.iter_mut().for_each(|crowd| (0..self.state.members.len()).for_each(|i| crowd.dress(i, &self.state.people)));
         Ok(())
     }
 

@@ -1,10 +1,10 @@
-//! An episode as an animated glTF 2.0 binary: skinned people among boxes.
+//! An episode as an animated glTF 2.0 binary: skinned people among boxes or in a room.
 
 use super::buffer::Buffer;
 use crate::body::{BODY_JOINTS, BodyModel, JOINT_NAMES, JOINTS, ORIENT, PARAMS, PARENTS, ShapedBody, TRANSL, check_motion};
 use crate::io::write_atomic;
 use crate::motion::FPS;
-use crate::render::{Episode, Mesh, Rgb, Walker, colour};
+use crate::render::{Episode, Mesh, Rgb, Walker, by_colour, colour};
 use crate::scene::BoxObstacle;
 use crate::{Error, Result};
 use glam::{Mat4, Quat, Vec3};
@@ -22,7 +22,7 @@ pub fn write_glb(path: impl AsRef<Path>, model: &BodyModel, episode: &Episode) -
     write_atomic(path, &glb(model, episode)?)
 }
 
-/// A `.glb` of `episode`: one skinned body of 24 joints per walker, all boxes as one mesh, and one animation at 40 keyframes per
+/// A `.glb` of `episode`: one skinned body of 24 joints per walker, all boxes as one mesh or the room as one of each colour, and one animation at 40 keyframes per
 /// second with a rotation per body joint and the pelvis' translation. Metres; the node `world` turns z up into y up.
 ///
 /// Errors: no walker, frames or betas of a wrong length, non-finite values.
@@ -38,7 +38,10 @@ pub fn glb(model: &BodyModel, episode: &Episode) -> Result<Vec<u8>> {
         check_motion(walker.frames, walker.betas).map_err(|e| Error::invalid(format!("walker {i}: {e}")))?;
         file.person(model, &surface, walker, i);
     }
-    file.boxes(&episode.scene.obstacles);
+    match episode.room {
+        Some(room) => by_colour(room, |_| true).iter().for_each(|(mesh, shade)| file.solid("room", mesh, *shade)),
+        None => file.boxes(&episode.scene.obstacles),
+    }
     Ok(file.pack())
 }
 
@@ -186,10 +189,15 @@ impl Document {
         self.channels.push(json!({ "sampler": self.samplers.len() - 1, "target": { "node": node, "path": path } }));
     }
 
-    /// All boxes as one mesh, whose triangles share no vertex, so that the edges look sharp.
+    /// All boxes as one mesh.
     fn boxes(&mut self, boxes: &[BoxObstacle]) {
         let mut mesh = Mesh::default();
         boxes.iter().for_each(|b| mesh.append(&Mesh::cuboid(b.centre, b.size / 2.0, b.yaw, b.height)));
+        self.solid("boxes", &mesh, colour::STONE);
+    }
+
+    /// A mesh that stands still, unless it is empty; its triangles share no vertex, so that the edges look sharp.
+    fn solid(&mut self, name: &str, mesh: &Mesh, shade: Rgb) {
         let corners: Vec<Vec3> = mesh.faces.as_flattened().iter().map(|&i| mesh.vertices[i as usize]).collect();
         if corners.is_empty() {
             return;
@@ -198,10 +206,10 @@ impl Document {
         let flat = Mesh { vertices: corners, faces };
         let floats = |all: &[Vec3]| all.iter().map(Vec3::to_array).collect::<Vec<_>>();
         let (positions, normals) = (self.buffer.vertices(&floats(&flat.vertices)), self.buffer.vertices(&floats(&flat.normals())));
-        let mesh = self.mesh("boxes", json!({ "POSITION": positions, "NORMAL": normals }), None, colour::STONE);
+        let mesh = self.mesh(name, json!({ "POSITION": positions, "NORMAL": normals }), None, shade);
         let node = self.nodes.len();
         self.nodes[WORLD].children.push(node);
-        self.nodes.push(Node { name: "boxes".into(), mesh: Some(mesh), ..Node::default() });
+        self.nodes.push(Node { name: name.into(), mesh: Some(mesh), ..Node::default() });
     }
 
     fn pack(self) -> Vec<u8> {

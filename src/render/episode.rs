@@ -1,11 +1,12 @@
-//! A recorded episode in pictures: people walking among boxes as a filmstrip, as ghosts and from above.
+//! A recorded episode in pictures: people walking among boxes or in a room as a filmstrip, as ghosts and from above.
 
 use super::colour::PEOPLE;
+use super::room::{CutAway, by_colour};
 use super::top_view::PATH_WIDTH;
 use super::{Camera, Image, Mesh, Rgb, Shading, Stage, TopView, colour, film, ramp};
 use crate::body::{BodyModel, FOOT_MARKERS, MARKER_DIM, PARAMS, ShapedBody, check_motion, joint};
 use crate::motion::FPS;
-use crate::scene::Scene;
+use crate::scene::{Scene, TriMesh};
 use crate::{Error, Result};
 use glam::{Vec2, Vec3};
 
@@ -15,6 +16,9 @@ const STANCE_HEIGHT: f32 = 0.08;
 const STANCE_SPEED: f32 = 0.2;
 /// Height of the person that the camera makes room for, metres.
 const HEAD_ROOM: f32 = 1.9;
+/// How much the camera rises for each metre away; steeper among furniture, over which it looks.
+const FLAT: f32 = 0.62;
+const STEEP: f32 = 1.1;
 
 /// One person's part of an episode.
 #[derive(Clone, Copy, Debug)]
@@ -33,6 +37,8 @@ pub struct Episode<'a> {
     pub walkers: &'a [Walker<'a>],
     /// Where it happens; for a changing scene, how it stood at one moment.
     pub scene: &'a Scene,
+    /// What stands there, for a room.
+    pub room: Option<&'a TriMesh>,
     /// Distance within which a goal counts as reached, metres.
     pub reach: f32,
 }
@@ -51,9 +57,10 @@ impl<'a> Episode<'a> {
     pub fn panels(&self, model: &BodyModel, count: usize, columns: usize, width: usize, height: usize) -> Result<Image> {
         let tracks = self.tracks(model)?;
         let camera = self.camera(&tracks, width, height)?;
+        let scene = self.stage(&camera)?;
         let frames: Vec<_> = (0..count)
             .map(|i| {
-                let mut stage = self.stage();
+                let mut stage = scene.clone();
                 let mut seconds = 0.0f32;
                 for (w, track) in tracks.iter().enumerate() {
                     let frame = moment(i, count, track.pelvis.len());
@@ -72,7 +79,8 @@ impl<'a> Episode<'a> {
     /// Errors as in [`Episode::panels`].
     pub fn ghosts(&self, model: &BodyModel, count: usize, width: usize, height: usize) -> Result<Image> {
         let tracks = self.tracks(model)?;
-        let mut stage = self.stage();
+        let camera = self.camera(&tracks, width, height)?;
+        let mut stage = self.stage(&camera)?;
         for (w, track) in tracks.iter().enumerate() {
             for i in 0..count {
                 let shade =
@@ -81,7 +89,7 @@ impl<'a> Episode<'a> {
             }
             stage.add(&track.way(track.pelvis.len()), colour::INK, Shading::Smooth);
         }
-        Ok(stage.render(&self.camera(&tracks, width, height)?))
+        Ok(stage.render(&camera))
     }
 
     /// The plan, `width` pixels wide: scene, pelvis paths, starts, goals and where the foot markers stand.
@@ -90,11 +98,21 @@ impl<'a> Episode<'a> {
     pub fn top_view(&self, model: &BodyModel, width: usize) -> Result<Image> {
         let tracks = self.tracks(model)?;
         let (rings, boxes) = (self.rings(), self.boxes());
-        // What matters is near the boxes and the way; a far wall would only make it small.
-        let mut seen: Vec<Vec2> = boxes.iter().flatten().copied().collect();
-        seen.extend(self.points(&tracks).map(|p| p.truncate()));
-        let mut view = TopView::around(seen, 0.3, width)?;
-        view.polygon(&rings, [226, 232, 224], colour::STONE);
+        let mut view = match self.room {
+            Some(_) => {
+                let (low, high) = self.scene.walkable.bounds();
+                TopView::around([low.as_vec2(), high.as_vec2()], 0.3, width)?
+            }
+            None => {
+                // What matters is near the boxes and the way; a far wall would only make it small.
+                let ways = self.points(&tracks).map(|p| p.truncate());
+                TopView::around(boxes.iter().flatten().copied().chain(ways), 0.3, width)?
+            }
+        };
+        match self.room {
+            Some(_) => view.room(self.room, &self.scene.walkable)?,
+            None => view.polygon(&rings, [226, 232, 224], colour::STONE),
+        }
         boxes.iter().for_each(|b| view.polygon(std::slice::from_ref(b), colour::STONE, colour::INK));
         for (w, track) in tracks.iter().enumerate() {
             let line: Vec<Vec2> = track.pelvis.iter().map(|p| p.truncate()).collect();
@@ -128,20 +146,28 @@ impl<'a> Episode<'a> {
         self.scene.obstacles.iter().map(|b| b.corners().map(|p| p.as_vec2()).to_vec()).collect()
     }
 
-    /// Boxes, the border of the walkable polygon and the goals.
-    fn stage(&self) -> Stage {
+    /// The goals and what stands in the scene: the room as far as it does not hide it from the camera, or boxes and the border of the
+    /// walkable polygon.
+    fn stage(&self, camera: &Camera) -> Result<Stage> {
         let mut stage = Stage::new();
-        for b in &self.scene.obstacles {
-            stage.add(&Mesh::cuboid(b.centre, b.size / 2.0, b.yaw, b.height), colour::STONE, Shading::Flat);
-        }
-        for ring in self.rings() {
-            let border: Vec<Vec3> = ring.iter().chain(ring.first()).map(|p| p.extend(0.01)).collect();
-            stage.add(&Mesh::tube(&border, 0.015), colour::INK, Shading::Smooth);
+        if let Some(room) = self.room {
+            let cut = CutAway::new(&self.scene.walkable, camera.eye())?;
+            for (mesh, colour) in by_colour(room, |t| cut.shows(t)) {
+                stage.add(&mesh, colour, Shading::Flat);
+            }
+        } else {
+            for b in &self.scene.obstacles {
+                stage.add(&Mesh::cuboid(b.centre, b.size / 2.0, b.yaw, b.height), colour::STONE, Shading::Flat);
+            }
+            for ring in self.rings() {
+                let border: Vec<Vec3> = ring.iter().chain(ring.first()).map(|p| p.extend(0.01)).collect();
+                stage.add(&Mesh::tube(&border, 0.015), colour::INK, Shading::Smooth);
+            }
         }
         for goal in self.walkers.iter().filter_map(|w| w.goal) {
             stage.add(&Mesh::sphere(goal.extend(0.0), self.reach.max(0.05), 3), colour::GREEN, Shading::Smooth);
         }
-        stage
+        Ok(stage)
     }
 
     /// Every point of the floor that a picture should show: the ways, the goals and the boxes.
@@ -158,6 +184,7 @@ impl<'a> Episode<'a> {
         let aside = along.perp() * -0.9 - along * 0.45;
         let (low, high) = self.points(tracks).fold((Vec3::MAX, Vec3::MIN), |(l, h), p| (l.min(p), h.max(p)));
         let target = 0.5 * (low + high).with_z(HEAD_ROOM);
+        let rise = if self.room.is_some() { STEEP } else { FLAT };
         let size = Vec2::new(width as f32, height as f32);
         let shown = |camera: &Camera| {
             self.points(tracks)
@@ -166,7 +193,7 @@ impl<'a> Episode<'a> {
         };
         let mut distance = 3.0;
         loop {
-            let camera = Camera::look_at(target + distance * aside.extend(0.62), target, width, height, 0.6)?;
+            let camera = Camera::look_at(target + distance * aside.extend(rise), target, width, height, 0.6)?;
             if distance > 500.0 || shown(&camera) {
                 return Ok(camera);
             }
@@ -239,7 +266,7 @@ mod tests {
         let walkers = [Walker { frames: &frames, betas: &BETAS_ZERO, goal: Some(Vec2::new(3.0, 0.0)) }];
         let block = BoxObstacle { centre: Vec2::new(1.0, -1.0), size: Vec2::new(0.8, 0.4), yaw: 0.5, height: 1.0 };
         let scene = Scene::with_boxes(4.0, vec![block]).unwrap();
-        let episode = Episode { walkers: &walkers, scene: &scene, reach: 0.1 };
+        let episode = Episode { walkers: &walkers, scene: &scene, room: None, reach: 0.1 };
         let image = episode.top_view(&model, 608).unwrap();
         // The box, the way and the goal are in the picture, the far walls are not.
         let seen = block.corners().map(|p| p.as_vec2()).into_iter().chain([Vec2::ZERO, Vec2::new(2.0, 1.0), Vec2::new(3.0, 0.0)]);
@@ -262,7 +289,7 @@ mod tests {
         let model = toy();
         let frames = straight(&model);
         let walkers = [Walker { frames: &frames, betas: &BETAS_ZERO, goal: None }];
-        let episode = Episode { walkers: &walkers, scene: &Scene::default(), reach: 0.1 };
+        let episode = Episode { walkers: &walkers, scene: &Scene::default(), room: None, reach: 0.1 };
         let sheet = episode.panels(&model, 3, 3, 60, 40).unwrap();
         assert_eq!((sheet.width, sheet.height), (3 * 60 + 2 * 4, 40));
         assert_eq!((moment(0, 3, 21), moment(1, 3, 21), moment(2, 3, 21), moment(0, 1, 1)), (0, 10, 20, 0));
@@ -296,11 +323,11 @@ mod tests {
         let model = toy();
         let draw = |frames: &[f32], betas: &[f32]| {
             let walkers = [Walker { frames, betas, goal: None }];
-            Episode { walkers: &walkers, scene: &Scene::default(), reach: 0.1 }.top_view(&model, 200).map_err(|e| e.to_string())
+            Episode { walkers: &walkers, scene: &Scene::default(), room: None, reach: 0.1 }.top_view(&model, 200).map_err(|e| e.to_string())
         };
         assert!(draw(&[0.0; 92], &BETAS_ZERO).unwrap_err().contains("93"));
         assert!(draw(&[], &BETAS_ZERO).is_err() && draw(&[0.0; 93], &[0.0; 9]).is_err());
         assert!(draw(&[f32::NAN; 93], &BETAS_ZERO).unwrap_err().contains("walker 0: frame 0"));
-        assert!(Episode { walkers: &[], scene: &Scene::default(), reach: 0.1 }.ghosts(&model, 3, 60, 40).is_err());
+        assert!(Episode { walkers: &[], scene: &Scene::default(), room: None, reach: 0.1 }.ghosts(&model, 3, 60, 40).is_err());
     }
 }

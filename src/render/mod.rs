@@ -10,6 +10,7 @@ mod intersect;
 mod mesh;
 mod plan;
 mod relief;
+mod room;
 mod stage;
 mod top_view;
 
@@ -20,6 +21,7 @@ pub use film::{film, tile};
 pub use image::{Image, Rgb, ramp};
 pub use mesh::Mesh;
 pub use plan::ScenePlan;
+pub(crate) use room::by_colour;
 pub use stage::{Hit, Shading, Stage, TracedStage};
 pub use top_view::TopView;
 

@@ -1,13 +1,10 @@
 //! Plans of scenes: what stands there, where people may walk, and ways.
 
-use super::stage::encode;
-use super::{Image, Rgb, TopView, colour};
+use super::{Image, TopView, colour};
 use crate::Result;
-use crate::scene::{Grid, Polygon, TriMesh};
-use glam::{DVec2, Vec2, Vec4};
+use crate::scene::{Polygon, TriMesh};
+use glam::{DVec2, Vec2};
 
-/// Laid over what can be walked on.
-const FREE: Rgb = [120, 190, 130];
 /// Metres round the scene.
 const BORDER: f32 = 0.3;
 
@@ -26,18 +23,7 @@ impl ScenePlan<'_> {
     /// The plan on an image `width` pixels wide.
     pub fn draw(&self, width: usize) -> Result<Image> {
         let mut view = TopView::around(self.walkable.exterior().iter().map(|p| p.as_vec2()), BORDER, width)?;
-        if let Some(mesh) = self.mesh {
-            let colours: Vec<Rgb> = mesh.materials.iter().map(|m| encode(Vec4::from(m.color).truncate())).collect();
-            let of = |i: usize| colours.get(usize::from(mesh.material[i])).copied().unwrap_or(colour::STONE);
-            view.relief((0..mesh.triangles.len()).map(|i| (mesh.corners(i), of(i))));
-        }
-        let grid = Grid::of_polygon(self.walkable, f64::from(view.metres()))?;
-        view.tint(FREE, 0.3, |p| grid.holds(p.as_dvec2()));
-        let rings: Vec<Vec<Vec2>> = self.walkable.rings().map(|r| r.iter().map(|p| p.as_vec2()).collect()).collect();
-        for ring in &rings {
-            let closed: Vec<Vec2> = ring.iter().chain(ring.first()).copied().collect();
-            view.path(&closed, 1.5, colour::GREEN);
-        }
+        view.room(self.mesh, self.walkable)?;
         for (way, colour) in self.ways.iter().zip(colour::PEOPLE.into_iter().cycle()) {
             let way: Vec<Vec2> = way.iter().map(|p| p.as_vec2()).collect();
             view.path(&way, 2.5, colour);
@@ -54,6 +40,7 @@ impl ScenePlan<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::render::Rgb;
     use crate::scene::Rooms;
 
     #[test]

@@ -19,7 +19,7 @@ mod sparse;
 mod walkable;
 
 pub use bundle::{PICTURE, SceneBundle};
-pub use crowded::{CrowdedScene, CrowdedScenes};
+pub use crowded::{BundleFolders, CrowdedScene, CrowdedScenes};
 pub use depths::{Depths, Probe};
 pub use grid::Grid;
 pub use make::{MakeOptions, SceneFiles, Stages};

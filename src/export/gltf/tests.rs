@@ -101,7 +101,7 @@ fn skinning_by_the_rules_of_the_format_is_ours() {
     let shapes = [[0.0; BETAS], [1.5, -1.0, 0.5, 0.0, 0.8, 0.0, -0.6, 0.0, 0.3, 1.0]];
     let (a, b) = (frames(1), frames(20));
     let walkers = [(&a, &shapes[0]), (&b, &shapes[1])].map(|(frames, betas)| Walker { frames, betas, goal: None });
-    let episode = Episode { walkers: &walkers, scene: &Scene::default(), reach: 0.1 };
+    let episode = Episode { walkers: &walkers, scene: &Scene::default(), room: None, reach: 0.1 };
     let bytes = glb(&model, &episode).unwrap();
     assert!(bytes == glb(&model, &episode).unwrap());
     let file = File::new(&bytes);
@@ -127,7 +127,7 @@ fn textures_stay_and_keyframes_turn_the_short_way() {
     let mut frames = vec![0.0; 3 * PARAMS];
     [3.0, 3.1, 3.2 - std::f32::consts::TAU].iter().enumerate().for_each(|(t, &angle)| frames[t * PARAMS + ORIENT.start] = angle);
     let walkers = [Walker { frames: &frames, betas: &[0.0; BETAS], goal: None }];
-    let file = File::new(&glb(&model, &Episode { walkers: &walkers, scene: &Scene::default(), reach: 0.1 }).unwrap());
+    let file = File::new(&glb(&model, &Episode { walkers: &walkers, scene: &Scene::default(), room: None, reach: 0.1 }).unwrap());
     let primitive = &file.json["meshes"][0]["primitives"][0];
     let uv = file.rows(&primitive["attributes"]["TEXCOORD_0"]);
     for (corner, &t) in file.rows(&primitive["indices"]).iter().zip(model.uv_faces().as_flattened()) {
@@ -153,7 +153,7 @@ fn boxes_stand_on_the_floor_facing_out() {
     let scene = Scene::with_boxes(4.0, vec![block]).unwrap();
     let frames = [0.0; PARAMS];
     let walkers = [Walker { frames: &frames, betas: &[0.0; BETAS], goal: None }];
-    let file = File::new(&glb(&model, &Episode { walkers: &walkers, scene: &scene, reach: 0.1 }).unwrap());
+    let file = File::new(&glb(&model, &Episode { walkers: &walkers, scene: &scene, room: None, reach: 0.1 }).unwrap());
     let attributes = &file.json["meshes"][1]["primitives"][0]["attributes"];
     let (positions, normals) = (file.rows(&attributes["POSITION"]), file.rows(&attributes["NORMAL"]));
     assert_eq!(positions.len(), 36);
@@ -170,7 +170,10 @@ fn boxes_stand_on_the_floor_facing_out() {
 #[test]
 fn bad_recordings_are_refused() {
     let write = |walkers: &[Walker]| {
-        glb(&BodyModel::embedded(), &Episode { walkers, scene: &Scene::default(), reach: 0.1 }).map(|_| ()).unwrap_err().to_string()
+        glb(&BodyModel::embedded(), &Episode { walkers, scene: &Scene::default(), room: None, reach: 0.1 })
+            .map(|_| ())
+            .unwrap_err()
+            .to_string()
     };
     let walker = |frames| Walker { frames, betas: &[0.0; BETAS], goal: None };
     assert!(write(&[]).contains("without walkers"));

@@ -6,6 +6,7 @@ use egogen::body::BodyModel;
 use egogen::export::write_glb;
 use egogen::motion::amass::write_amass;
 use egogen::render::{Episode, Image, Walker, tile};
+use egogen::scene::TriMesh;
 use egogen_envs::motion::MotionEnv;
 use egogen_train::evaluate::{Actor, Film, Greedy, Played, play};
 use egogen_train::program::{self, Given};
@@ -22,7 +23,9 @@ use std::process::ExitCode;
     version,
     after_help = "Examples:
   play checkpoints/policy/quick --out runs/play
-  play prior --starts 4                     the motion model wandering; also: zero, greedy"
+  play prior --starts 4                     the motion model wandering; also: zero, greedy
+  play runs/rooms/policy --set max_depth=13 --set rooms.kind=furnished
+  play runs/rooms/policy --set 'rooms.bundles.train=[\"scenes/scan\"]'"
 )]
 struct Args {
     /// A policy bundle, or one of the baselines zero, prior, greedy
@@ -68,12 +71,16 @@ fn run(args: &Args) -> Result<u8> {
         }
     };
     let reach = env.task().success_distance;
+    // The rooms of the first episodes, which are those that are played.
+    let mesh = |i: usize| env.room(i).map(|room| room.mesh.clone()).filter(|mesh| !mesh.triangles.is_empty());
+    let rooms: Vec<Option<TriMesh>> = (0..args.starts.get()).map(mesh).collect();
     let played = play(&mut env, &actor, args.seed, true)?;
     let body = world.sim.body();
     let mut plans = Vec::new();
     for p in &played {
         let Some(film) = &p.film else { continue };
-        draw(film, reach, |episode| {
+        let room = rooms.get(p.start as usize).and_then(Option::as_ref);
+        draw(film, room, reach, |episode| {
             plans.push(episode.top_view(body, 320)?);
             if (p.start as usize) < args.films {
                 strips(&episode, body, p, &args.out)?;
@@ -90,9 +97,9 @@ fn run(args: &Args) -> Result<u8> {
     Ok(0)
 }
 
-fn draw(film: &Film, reach: f32, picture: impl FnOnce(Episode) -> Result<()>) -> Result<()> {
+fn draw(film: &Film, room: Option<&TriMesh>, reach: f32, picture: impl FnOnce(Episode) -> Result<()>) -> Result<()> {
     let walkers = [Walker { frames: &film.frames, betas: &film.betas, goal: Some(film.setting.goal) }];
-    picture(Episode { walkers: &walkers, scene: &film.setting.scene, reach })
+    picture(Episode { walkers: &walkers, scene: &film.setting.scene, room, reach })
 }
 
 fn strips(episode: &Episode, body: &BodyModel, p: &Played, out: &std::path::Path) -> Result<()> {

@@ -83,7 +83,7 @@ impl Export {
         };
         let betas = [0.0; BETAS];
         let walkers = [Walker { frames: &frames, betas: &betas, goal: None }];
-        let episode = Episode { walkers: &walkers, scene: &Scene::default(), reach: 0.1 };
+        let episode = Episode { walkers: &walkers, scene: &Scene::default(), room: None, reach: 0.1 };
         let file = |ending: &str| {
             let mut name = self.out.as_os_str().to_owned();
             name.push(ending);

@@ -29,6 +29,49 @@ fn baselines_are_reported_the_same_every_time() {
 }
 
 #[test]
+fn scenarios_make_one_report() {
+    let dir = tempfile::tempdir().unwrap();
+    let own = "about = 'Two meet'\nscenes = 2\n[layout]\nkind = 'circle'\npeople = 2\nradius = 1.5\nwall = 4.0\n";
+    std::fs::write(dir.path().join("mine.toml"), own).unwrap();
+    let policy = concat!(env!("CARGO_MANIFEST_DIR"), "/../checkpoints/policy/quick");
+    let arguments = [
+        policy,
+        "--no-baselines",
+        "--blind",
+        "--scenario",
+        "mine.toml",
+        "--scenario",
+        "midpoint",
+        "--episodes",
+        "4",
+        "--motions",
+        "1",
+        "--out",
+        "r",
+    ];
+    let done = run(env!("CARGO_BIN_EXE_evaluate"), &arguments, dir.path());
+    assert!(done.status.success(), "{}", text(&done.stderr));
+    let read = |name: &str| std::fs::read_to_string(dir.path().join("r").join(name)).unwrap();
+    let json: serde_json::Value = serde_json::from_str(&read("report.json")).unwrap();
+    let [mine, midpoint] = [0, 1].map(|i| &json["scenarios"][i]);
+    assert_eq!((&mine["name"], &mine["scenes"], &mine["episodes"]), (&"mine".into(), &2.into(), &4.into()));
+    assert_eq!((midpoint["scenes"].as_u64(), midpoint["rows"].as_array().unwrap().len()), (Some(10), 3));
+    assert!(mine["rows"][0]["inside_frames"]["high"].is_f64() && midpoint["rows"][0]["inside_frames"].is_null());
+    // Ten ways of the stochastic policy differ, of the deterministic one they do not.
+    let spread = |row: usize| midpoint["rows"][row]["path_distance"]["value"].as_f64().unwrap();
+    assert!(spread(0) > 0.01 && spread(1) == 0.0, "{} {}", spread(0), spread(1));
+    assert_eq!(mine["differences"].as_array().unwrap().len(), 2);
+    let html = read("report.html");
+    for part in ["<svg", "data:image/png;base64,", "vertices in others", "no egosensing", "side entropy"] {
+        assert!(html.contains(part), "{part}");
+    }
+    assert!(!html.contains("src=\"http") && !html.contains("href") && !html.contains("<script"), "needs nothing else");
+    let motions = dir.path().join("r/motions/mine/quick--deterministic");
+    let names: Vec<_> = std::fs::read_dir(motions).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+    assert_eq!(names.len(), 3, "{names:?}");
+}
+
+#[test]
 fn episodes_become_pictures() {
     let dir = tempfile::tempdir().unwrap();
     let done = run(env!("CARGO_BIN_EXE_play"), &["prior", "--starts", "2", "--films", "1", "--out", "pictures"], dir.path());

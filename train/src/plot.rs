@@ -5,7 +5,16 @@ use plotters::prelude::*;
 use std::ops::Range;
 
 /// Colours of lines, from the first.
-pub const COLOURS: [RGBColor; 4] = [RGBColor(52, 100, 180), RGBColor(214, 116, 40), RGBColor(60, 140, 80), RGBColor(150, 70, 150)];
+pub const COLOURS: [RGBColor; 8] = [
+    RGBColor(52, 100, 180),
+    RGBColor(214, 116, 40),
+    RGBColor(60, 140, 80),
+    RGBColor(150, 70, 150),
+    RGBColor(190, 50, 50),
+    RGBColor(90, 170, 200),
+    RGBColor(120, 100, 60),
+    RGBColor(110, 110, 120),
+];
 /// Pixels of what [`lines`] and [`histogram`] draw, of which three stand side by side, and [`map`] and [`ways`], of which four do.
 const SIZE: (u32, u32) = (380, 290);
 const SMALL: (u32, u32) = (282, 262);

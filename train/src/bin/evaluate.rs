@@ -3,10 +3,13 @@
 use clap::Parser;
 use egogen::agent::bundle::Bundle;
 use egogen::io::write_atomic;
-use egogen_train::evaluate::{Actor, Greedy, Row, Scenario, Setup, play, shipped, table};
+use egogen_train::evaluate::{
+    Actor, Greedy, Outcome, Played, Row, Scenario, Setup, add_meanings, add_scenario, differences, shipped, table, write_motions,
+};
+use egogen_train::html::Page;
 use egogen_train::program::{self, Given};
 use egogen_train::{Error, Result};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -53,7 +56,11 @@ struct Args {
     /// Each policy once more without egosensing: every ray at its full length
     #[arg(long)]
     blind: bool,
-    /// Folder for report.json and report.md
+    /// Write the motion of the first N scenes of every scenario and policy to OUT/motions: npz in AMASS's layout of each person, glTF of
+    /// each scene
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    motions: usize,
+    /// Folder for report.html, report.json and report.md
     #[arg(long, value_name = "DIR", default_value = "runs/evaluation")]
     out: PathBuf,
 }
@@ -67,23 +74,54 @@ fn run(args: &Args) -> Result<u8> {
     let task = program::task(&args.set)?;
     let mut setups = scenarios(args)?.into_iter().map(|s| Setup::new(s, &task, &world, args.seed)).collect::<Result<Vec<_>>>()?;
     let actors = actors(args, &setups)?;
+    // Policies are compared with the first of them, baselines alone with the first baseline.
+    let reference = actors.iter().position(|(_, a)| matches!(a, Actor::Policy { .. })).unwrap_or(0);
+    let mut page = Page::new("Evaluation");
+    page.code(&std::env::args().collect::<Vec<_>>().join(" "));
     let (mut text, mut told) = (String::new(), Vec::new());
     for setup in &mut setups {
-        let scenario = setup.scenario.clone();
-        let mut rows = Vec::new();
-        for (name, actor) in &actors {
-            eprintln!("{}: {name}, {} episodes", scenario.name, setup.place.len());
-            rows.push(Row::new(name, &play(&mut setup.env, actor, args.seed, false)?));
-        }
-        text += &format!("## {}\n\n{}.\n\n{}\n", scenario.name, scenario.about, table(&rows));
-        let task = setup.env.task();
-        told.push(json!({"name": scenario.name, "scenario": scenario, "task": task, "episodes": setup.place.len(), "rows": rows}));
+        let played = play_all(args, setup, &actors)?;
+        let rows: Vec<Row> = actors.iter().zip(&played).map(|((name, _), p)| Row::new(name, p)).collect();
+        let differences: Vec<_> = played.iter().map(|p| differences(p, &played[reference])).collect();
+        let outcome = Outcome { setup, rows: &rows, played: &played, differences: &differences, reference };
+        add_scenario(&mut page, &outcome)?;
+        let s = &setup.scenario;
+        text += &format!("## {}\n\n{}. {} episodes.\n\n{}", s.name, s.about, setup.place.len(), table(&rows));
+        let others = rows.iter().zip(differences).filter(|(row, _)| row.name != rows[reference].name);
+        let others: Vec<_> = others.map(|(row, d)| json!({"name": row.name, "less": rows[reference].name, "figures": d})).collect();
+        let head =
+            json!({"name": s.name, "scenario": s, "task": setup.env.task(), "scenes": setup.solids.len(), "episodes": setup.place.len()});
+        told.push(merged(head, json!({"rows": rows, "differences": others})));
     }
     println!("{text}");
+    add_meanings(&mut page);
     let report = json!({"format": FORMAT, "seed": args.seed, "origin": world.origin(), "scenarios": told});
     write_atomic(args.out.join("report.json"), format!("{report:#}").as_bytes())?;
     write_atomic(args.out.join("report.md"), text.as_bytes())?;
+    write_atomic(args.out.join("report.html"), page.finish().as_bytes())?;
     Ok(0)
+}
+
+/// Everybody's episodes of a scenario, by policy; writes the motion of as many scenes as is asked for.
+fn play_all(args: &Args, setup: &mut Setup, actors: &[(String, Actor)]) -> Result<Vec<Vec<Played>>> {
+    let mut all = Vec::new();
+    for (name, actor) in actors {
+        eprintln!("{}: {name}, {} episodes", setup.scenario.name, setup.place.len());
+        let played = setup.play(actor, args.seed)?;
+        let plain: String = name.chars().map(|c| if c.is_ascii_alphanumeric() || c == '.' { c } else { '-' }).collect();
+        let dir = args.out.join("motions").join(&setup.scenario.name).join(plain);
+        write_motions(setup, &played, args.motions, &dir)?;
+        all.push(played);
+    }
+    Ok(all)
+}
+
+/// Both objects' entries in one.
+fn merged(mut a: Value, b: Value) -> Value {
+    if let (Some(a), Value::Object(b)) = (a.as_object_mut(), b) {
+        a.extend(b);
+    }
+    a
 }
 
 /// The scenarios asked for, each once.

@@ -1,12 +1,12 @@
 //! Plays each start once and measures it.
 
-use super::Actor;
+use super::{Actor, Measured};
 use crate::{Error, Result};
 use egogen::body::{BETAS, MARKER_DIM, PARAMS};
-use egogen::metrics::{contact_score, stance_slide};
+use egogen::metrics::stance_slide;
 use egogen::motion::{FRAMES, PosePrior, SEED};
 use egogen::scene::Setting;
-use egogen_envs::motion::{EPISODE, MotionEnv};
+use egogen_envs::motion::{EPISODE, MotionEnv, TERMS};
 use egogen_envs::{StepResult, VecEnv};
 
 /// The recorded motion of one episode.
@@ -23,24 +23,30 @@ pub struct Film {
 /// One episode, measured.
 #[derive(Clone, Debug, Default)]
 pub struct Played {
+    /// Number of the person.
+    pub person: usize,
     /// Number of the start.
     pub start: u64,
+    /// Number of the scene, whose people are not independent of each other.
+    pub group: usize,
     /// The environment's figures, in the order of [`EPISODE`].
     pub figures: [f32; EPISODE.len()],
     /// Mean distance between predicted and skinned markers, metres: how far the prediction is from any body.
     pub body_error: f32,
     /// Mean ||VP|| of its frames under the shipped pose prior (eq. 9).
     pub pose_norm: f32,
-    /// Mean foot contact score of its primitives (eq. 12).
-    pub contact: f32,
     /// Mean slide per stance of its primitives, metres.
     pub slide: f32,
     /// Mean per-dimension KL to N(0, I) of the actions, nats; NaN for baselines.
     pub kl: f32,
     /// Mean 0.5 mean(mu^2) of the actions; NaN for baselines.
     pub kl_mean: f32,
+    /// steps x 9 weighted reward terms, in the order of [`TERMS`].
+    pub terms: Vec<f32>,
     /// The motion, where it was asked for.
     pub film: Option<Film>,
+    /// What the motion tells, where it was looked at.
+    pub measured: Option<Measured>,
 }
 
 impl Played {
@@ -54,14 +60,15 @@ impl Played {
 #[derive(Clone, Default)]
 struct Running {
     steps: f32,
-    sums: [f32; 6],
+    sums: [f32; 5],
+    terms: Vec<f32>,
     film: Film,
 }
 
 /// The first episode of every environment of `env` (one start each, numbered from 0) with `actor`. `record` keeps the motion.
 pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Result<Vec<Played>> {
     let n = env.num_envs();
-    let prior = PosePrior::embedded()?;
+    let (prior, width) = (PosePrior::embedded()?, env.spec().info.len());
     let (mut obs, mut result) = (Vec::new(), StepResult::default());
     env.reset(seed, &mut obs)?;
     let mut running = vec![Running::default(); n];
@@ -75,9 +82,10 @@ pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Resu
         for i in (0..n).filter(|&i| done[i].is_none()).collect::<Vec<_>>() {
             let kl = [&choice.kl, &choice.kl_mean].map(|k| k.get(i).copied().unwrap_or(f32::NAN));
             running[i].add(env, &prior, i, kl, record);
+            running[i].terms.extend_from_slice(&result.info[i * width..][..TERMS.len()]);
             if result.terminated[i] || result.truncated[i] {
                 let figures = result.episode[i * EPISODE.len()..].first_chunk().copied().unwrap_or_default();
-                done[i] = Some(std::mem::take(&mut running[i]).finish(i as u64, figures, record));
+                done[i] = Some(std::mem::take(&mut running[i]).finish(i, figures, record));
             }
         }
         if done.iter().all(Option::is_some) {
@@ -102,7 +110,7 @@ impl Running {
         let shaped = env.sim().body().shape(&betas);
         let norms = prior.norms(&params[SEED * PARAMS..]);
         let pose_norm = norms.iter().sum::<f32>() / norms.len() as f32;
-        let figures = [body_error(&shaped, markers, params), pose_norm, contact_score(markers), stance_slide(markers), kl[0], kl[1]];
+        let figures = [body_error(&shaped, markers, params), pose_norm, stance_slide(markers), kl[0], kl[1]];
         self.sums.iter_mut().zip(figures).for_each(|(sum, x)| *sum += x);
         if record {
             prims.record(i, &shaped, &mut self.film.frames);
@@ -110,9 +118,10 @@ impl Running {
         self.steps += 1.0;
     }
 
-    fn finish(self, start: u64, figures: [f32; EPISODE.len()], record: bool) -> Played {
-        let [body_error, pose_norm, contact, slide, kl, kl_mean] = self.sums.map(|s| s / self.steps);
-        Played { start, figures, body_error, pose_norm, contact, slide, kl, kl_mean, film: record.then_some(self.film) }
+    fn finish(self, person: usize, figures: [f32; EPISODE.len()], record: bool) -> Played {
+        let [body_error, pose_norm, slide, kl, kl_mean] = self.sums.map(|s| s / self.steps);
+        let (start, group, film) = (person as u64, person, record.then_some(self.film));
+        Played { person, start, group, figures, body_error, pose_norm, slide, kl, kl_mean, terms: self.terms, film, measured: None }
     }
 }
 

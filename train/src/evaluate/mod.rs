@@ -1,14 +1,22 @@
-//! Policies and baselines on the same held-out starts: who acts, what is measured, what is reported.
+//! Policies and baselines on the same held-out starts: scenarios, who acts, what is measured, what is reported.
 
 mod actors;
 mod episodes;
-mod report;
+mod estimate;
+mod figures;
+mod measure;
+mod page;
+mod pictures;
 mod scenario;
 mod setup;
 mod way;
 
 pub use actors::{Actor, Greedy};
 pub use episodes::{Film, Played, play};
-pub use report::{Estimate, Row, mean, proportion, ratio, table};
+pub use estimate::{Estimate, mean, proportion, ratio, share};
+pub use figures::{Better, FIGURES, Figure, OF_STARTS, Row, differences, table};
+pub use measure::{Measured, measure};
+pub use page::{Outcome, add_meanings, add_scenario};
+pub use pictures::write_motions;
 pub use scenario::{Layout, Looks, Moving, Scenario, shipped};
 pub use setup::{Setup, Solids};

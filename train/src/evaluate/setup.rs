@@ -1,6 +1,7 @@
 //! A scenario ready to be played: people placed in their scenes.
 
 use super::scenario::{Layout, Looks, Moving, Scenario};
+use super::{Actor, Played, measure, play};
 use crate::program::Given;
 use crate::{Error, Result};
 use egogen::body::{BETAS, MARKER_DIM, PARAMS, TRANSL};
@@ -75,6 +76,16 @@ impl Setup {
         }
         let env = MotionEnv::staged(task, world.sim.clone(), cast).given()?;
         Ok(Self { scenario, env, place, start, solids })
+    }
+
+    /// Everybody's episode with `actor`, recorded and measured. `seed` fixes the noise.
+    pub fn play(&mut self, actor: &Actor, seed: u64) -> Result<Vec<Played>> {
+        let mut played = play(&mut self.env, actor, seed, true)?;
+        for (i, p) in played.iter_mut().enumerate() {
+            (p.start, p.group) = (self.start[i] as u64, self.place[i]);
+        }
+        measure(self, &mut played);
+        Ok(played)
     }
 
     /// Numbers of the people of each scene.
@@ -196,7 +207,6 @@ fn reshape(seed: &mut SeedMotion, betas: [f32; BETAS], world: &World) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Actor, Played, play};
     use super::*;
     use egogen::agent::bundle::Bundle;
     use egogen_envs::VecEnv;

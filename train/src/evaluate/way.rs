@@ -23,6 +23,11 @@ impl Way {
         Self { points: points.unwrap_or_else(|| vec![start, goal]) }
     }
 
+    /// Length of the way, metres.
+    pub fn length(&self) -> f32 {
+        self.points.windows(2).map(|s| s[0].distance(s[1])).sum()
+    }
+
     /// How far it still is from `at` over the nearest point of the way, metres, and the point of the way to turn to next.
     pub fn follow(&self, at: Vec2) -> (f32, Vec2) {
         let nearest = |s: &[Vec2]| {

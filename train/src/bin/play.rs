@@ -6,7 +6,6 @@ use egogen::body::BodyModel;
 use egogen::export::write_glb;
 use egogen::motion::amass::write_amass;
 use egogen::render::{Episode, Image, Walker, tile};
-use egogen::scene::TriMesh;
 use egogen_envs::motion::MotionEnv;
 use egogen_train::evaluate::{Actor, Film, Greedy, Played, play};
 use egogen_train::program::{self, Given};
@@ -71,16 +70,12 @@ fn run(args: &Args) -> Result<u8> {
         }
     };
     let reach = env.task().success_distance;
-    // The rooms of the first episodes, which are those that are played.
-    let mesh = |i: usize| env.room(i).map(|room| room.mesh.clone()).filter(|mesh| !mesh.triangles.is_empty());
-    let rooms: Vec<Option<TriMesh>> = (0..args.starts.get()).map(mesh).collect();
     let played = play(&mut env, &actor, args.seed, true)?;
     let body = world.sim.body();
     let mut plans = Vec::new();
     for p in &played {
         let Some(film) = &p.film else { continue };
-        let room = rooms.get(p.start as usize).and_then(Option::as_ref);
-        draw(film, room, reach, |episode| {
+        draw(film, reach, |episode| {
             plans.push(episode.top_view(body, 320)?);
             if (p.start as usize) < args.films {
                 strips(&episode, body, p, &args.out)?;
@@ -97,9 +92,9 @@ fn run(args: &Args) -> Result<u8> {
     Ok(0)
 }
 
-fn draw(film: &Film, room: Option<&TriMesh>, reach: f32, picture: impl FnOnce(Episode) -> Result<()>) -> Result<()> {
+fn draw(film: &Film, reach: f32, picture: impl FnOnce(Episode) -> Result<()>) -> Result<()> {
     let walkers = [Walker { frames: &film.frames, betas: &film.betas, goal: Some(film.setting.goal) }];
-    picture(Episode { walkers: &walkers, scene: &film.setting.scene, room, reach })
+    picture(Episode { walkers: &walkers, scene: &film.setting.scene, room: film.room.as_deref(), reach })
 }
 
 fn strips(episode: &Episode, body: &BodyModel, p: &Played, out: &std::path::Path) -> Result<()> {

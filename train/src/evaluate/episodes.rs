@@ -5,9 +5,10 @@ use crate::{Error, Result};
 use egogen::body::{BETAS, MARKER_DIM, PARAMS};
 use egogen::metrics::stance_slide;
 use egogen::motion::{FRAMES, PosePrior, SEED};
-use egogen::scene::Setting;
+use egogen::scene::{Setting, TriMesh};
 use egogen_envs::motion::{EPISODE, MotionEnv, TERMS};
 use egogen_envs::{StepResult, VecEnv};
+use std::sync::Arc;
 
 /// The recorded motion of one episode.
 #[derive(Clone, Debug, Default)]
@@ -18,6 +19,8 @@ pub struct Film {
     pub betas: Vec<f32>,
     /// Where it happened.
     pub setting: Setting,
+    /// What stood there, in a room.
+    pub room: Option<Arc<TriMesh>>,
 }
 
 /// One episode, measured.
@@ -74,7 +77,9 @@ pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Resu
     let mut running = vec![Running::default(); n];
     let mut done: Vec<Option<Played>> = vec![None; n];
     for (i, r) in running.iter_mut().enumerate() {
-        r.film = Film { frames: vec![], betas: env.people().betas[i * BETAS..(i + 1) * BETAS].to_vec(), setting: env.setting(i).clone() };
+        let room = env.room(i).filter(|room| record && !room.mesh.triangles.is_empty()).map(|room| Arc::new(room.mesh.clone()));
+        let betas = env.people().betas[i * BETAS..(i + 1) * BETAS].to_vec();
+        r.film = Film { frames: vec![], betas, setting: env.setting(i).clone(), room };
     }
     for step in 0..u64::from(env.task().max_depth) {
         let choice = actor.choose(env, &obs, &done.iter().map(Option::is_none).collect::<Vec<_>>(), seed, step)?;

@@ -40,7 +40,8 @@ fn together<T>(setup: &Setup, played: &[Played], who: &[usize], then: impl FnOnc
     let parts: Vec<Part> = films.iter().map(|f| Part { frames: part(f), betas: &f.betas, goal: f.setting.goal }).collect();
     let walkers: Vec<Walker> = parts.iter().map(|p| Walker { frames: &p.frames, betas: p.betas, goal: Some(p.goal) }).collect();
     let scene = standing(setup, &played[who[0]], who[0], &first.setting.scene);
-    Ok(Some(then(&Episode { walkers: &walkers, scene: &scene, reach: setup.env.task().success_distance })?))
+    let room = setup.solids[setup.place[who[0]]].as_ref().and_then(|s| s.mesh.as_deref());
+    Ok(Some(then(&Episode { walkers: &walkers, scene: &scene, room, reach: setup.env.task().success_distance })?))
 }
 
 /// The scene with what moves in it as it stood when the person was nearest to it.

@@ -6,7 +6,7 @@ use crate::program::Given;
 use crate::{Error, Result};
 use egogen::body::{BETAS, MARKER_DIM, PARAMS, TRANSL};
 use egogen::rng::{Stream, stream};
-use egogen::scene::{BoxObstacle, Scene, SceneBundle, SdfGrid, Split};
+use egogen::scene::{BoxObstacle, CrowdedScene, Scene, SceneBundle, SdfGrid, Split, TriMesh};
 use egogen::sim::{SeedMotion, World};
 use egogen_envs::motion::{Cast, MotionEnv, MotionTask, Mover, Place, Role};
 use glam::{Vec2, Vec3};
@@ -18,12 +18,21 @@ use std::sync::Arc;
 /// First two shape coefficients of a male-like and a female-like body (see the body's card).
 const BUILDS: [[f32; 2]; 2] = [[1.0, -1.0], [-1.0, 1.0]];
 
-/// Signed distance to what stands in a room.
+/// What stands in a room.
 #[derive(Clone)]
 pub struct Solids {
     pub sdf: Arc<SdfGrid>,
-    /// Height of the floor on which people walk at z = 0, metres.
+    /// For pictures; its floor at z = 0.
+    pub mesh: Option<Arc<TriMesh>>,
+    /// Height in `sdf` of the floor on which people walk at z = 0, metres.
     pub floor: f32,
+}
+
+impl Solids {
+    fn of(room: &CrowdedScene) -> Self {
+        let mesh = (!room.mesh.triangles.is_empty()).then(|| Arc::new(room.mesh.clone()));
+        Self { sdf: Arc::new(room.sdf.clone()), mesh, floor: 0.0 }
+    }
 }
 
 /// A scenario's people on their marks.
@@ -51,7 +60,7 @@ impl Setup {
         if scenario.layout == Layout::Task {
             let n = scenario.scenes;
             let env = MotionEnv::evaluation(task.clone(), world.sim.clone(), world.held_out.clone(), n, seed).given()?;
-            let room = |i| env.room(i).map(|room| Solids { sdf: Arc::new(room.sdf.clone()), floor: 0.0 });
+            let room = |i| env.room(i).map(Solids::of);
             let solids = (0..n).map(room).collect();
             return Ok(Self { scenario, env, place: (0..n).collect(), start: (0..n).collect(), solids });
         }
@@ -122,7 +131,7 @@ impl<'a> Source<'a> {
                 let made = rooms.make(Split::Test).given()?;
                 let furnished = made.iter().map(|r| Furnished {
                     scene: r.scene.clone(),
-                    solids: Some(Solids { sdf: Arc::new(r.sdf.clone()), floor: 0.0 }),
+                    solids: Some(Solids::of(r)),
                     pairs: r.pairs.iter().map(|p| [p.start, p.goal]).collect(),
                 });
                 Self::Rooms { people: *people, rooms: furnished.collect() }
@@ -134,7 +143,12 @@ impl<'a> Source<'a> {
                     return Err(Error::config(what));
                 }
                 let pairs = bundle.pairs.iter().map(|p| [p.start, p.goal]).collect();
-                let solids = bundle.sdf.map(|sdf| Solids { sdf: Arc::new(sdf), floor: bundle.floor });
+                let mut mesh = bundle.mesh;
+                if let Some(mesh) = &mut mesh {
+                    mesh.vertices.iter_mut().for_each(|v| v.z -= bundle.floor);
+                }
+                let mesh = mesh.map(Arc::new);
+                let solids = bundle.sdf.map(|sdf| Solids { sdf: Arc::new(sdf), mesh, floor: bundle.floor });
                 let scene = Scene { walkable: bundle.walkable, obstacles: Vec::new() };
                 Self::Rooms { people: *people, rooms: vec![Furnished { scene, solids, pairs }] }
             }

@@ -36,7 +36,8 @@ pub fn films(stage: &Stage, registry: &Registry, starts: usize) -> Result<Vec<(P
     for p in &played {
         let Some(film) = &p.film else { continue };
         let walkers = [Walker { frames: &film.frames, betas: &film.betas, goal: Some(film.setting.goal) }];
-        let episode = Episode { walkers: &walkers, scene: &film.setting.scene, reach: env.task().success_distance };
+        let (scene, room) = (&film.setting.scene, film.room.as_deref());
+        let episode = Episode { walkers: &walkers, scene, room, reach: env.task().success_distance };
         plans.push(episode.top_view(body, PLAN)?);
         if pictures.is_empty() {
             let strip = episode.panels(body, 8, 8, 140, 180)?;

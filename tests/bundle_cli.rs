@@ -28,8 +28,10 @@ fn description(dir: &Path) -> Value {
 }
 
 #[test]
-fn the_shipped_policy_is_whole() {
-    Bundle::read(concat!(env!("CARGO_MANIFEST_DIR"), "/../checkpoints/policy/quick").as_ref()).unwrap();
+fn the_shipped_policies_are_whole() {
+    for name in ["quick", "sparse", "crowded"] {
+        Bundle::read(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../checkpoints/policy").join(name)).unwrap();
+    }
 }
 
 #[test]

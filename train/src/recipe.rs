@@ -11,8 +11,9 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The recipes that come with the program: file stem and content.
-pub const EMBEDDED: [(&str, &str); 9] = [
+pub const EMBEDDED: [(&str, &str); 10] = [
     ("quick", include_str!("../recipes/quick.toml")),
+    ("sparse", include_str!("../recipes/sparse.toml")),
     ("crowded", include_str!("../recipes/crowded.toml")),
     ("paper", include_str!("../recipes/paper.toml")),
     ("point", include_str!("../recipes/point.toml")),

@@ -138,7 +138,8 @@ pub fn weigh(spec: &PolicySpec, parts: &[Vec<Delta>], grads: &mut [f32]) {
 fn weigh_piece(layer: &Dense, first: usize, delta: &Delta, weight: &mut [f32], add: bool) {
     let rows = delta.x.len() / layer.input;
     if rows == 0 {
-        return weight.iter_mut().for_each(|w| *w = if add { *w } else { 0.0 });
+        // A GRU over one frame, whose state is zero.
+        return weight.fill(0.0);
     }
     let dy = &delta.dy[delta.dy.len() - rows * layer.output..];
     let dy = Mat::strided(&dy[first..], rows, weight.len() / layer.input, layer.output);

@@ -2,7 +2,7 @@ use super::build::SdfOptions;
 use super::tree::{Tree, Tri};
 use super::*;
 use crate::scene::mesh::{MeshOptions, read_mesh};
-use crate::scene::{RoomKind, Rooms, TriMesh};
+use crate::scene::{Grid, Polygon, RoomKind, Rooms, TriMesh, Walkable, WalkableOptions};
 use glam::{Affine3A, Quat};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -167,17 +167,57 @@ struct Placed {
     at: Vec3,
 }
 
-/// Furniture of others on a floor that is a sheet; values as before.
-#[test]
-fn furniture_on_a_floor_as_open3d_has_it() {
+/// The unpacked furniture of others, where it is at hand.
+fn furniture() -> Option<tempfile::TempDir> {
     let shared = std::env::var_os("EGOGEN_SHARED").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
     let archive = shared.join("data/scenes.tar.gz");
     if !archive.is_file() {
         println!("skipped: no {} (set EGOGEN_SHARED)", archive.display());
-        return;
+        return None;
     }
     let dir = tempfile::tempdir().unwrap();
     assert!(std::process::Command::new("tar").arg("xzf").arg(archive).arg("-C").arg(dir.path()).status().unwrap().success());
+    Some(dir)
+}
+
+/// A sofa of others where a procedural hall is freest: solid inside, nearer than what stood there, and no longer floor to walk on.
+#[test]
+fn furniture_of_others_in_a_room() {
+    let Some(dir) = furniture() else { return };
+    let room = Rooms { kind: RoomKind::Hall, difficulty: 0.0 }.draw(5).unwrap();
+    let layout = |floor: &Polygon| SdfOptions { voxel: 0.1, ..SdfOptions::for_floor(floor, 0.0).unwrap() };
+    let bare = SdfGrid::build(&room.mesh, &layout(&room.walkable)).unwrap();
+    let place = |i: usize| bare.centre(bare.voxel_of(i));
+    let seat = |p: Vec3| (p.z - 0.3).abs() < 0.06 && room.walkable.contains(p.truncate().as_dvec2());
+    let freest = (0..bare.values.len()).filter(|&i| seat(place(i))).max_by(|&a, &b| bare.values[a].total_cmp(&bare.values[b])).unwrap();
+    let sofa = read_mesh(dir.path().join("scenes/sweethome3d_cc0/sofa/sofa.obj"), &MeshOptions::default()).unwrap().mesh;
+    let (low, high) = sofa.bounds().unwrap();
+    let (size, middle) = (high - low, 0.5 * (low + high));
+    let at = place(freest).with_z(0.0) - middle.with_z(low.z);
+    let mut mesh = room.mesh.clone();
+    mesh.append(&sofa, Affine3A::from_translation(at));
+    let walkable = |mesh: &TriMesh| Walkable::of_mesh(mesh, &WalkableOptions::default()).unwrap().polygon;
+    let area = |mesh: &TriMesh| Grid::of_polygon(&walkable(mesh), 0.02).unwrap().area();
+    let (lost, print) = (area(&room.mesh) - area(&mesh), f64::from(size.x * size.y));
+    // It does not fill its bounds.
+    assert!((0.5 * print..1.1 * print).contains(&lost), "{lost} of {print} m2");
+    let full = SdfGrid::sample(&mesh, &layout(&walkable(&mesh)), bare.lowest, bare.dims).unwrap();
+    let mut inside = 0;
+    for (i, (&before, &now)) in bare.values.iter().zip(&full.values).enumerate() {
+        let beside = (place(i) - (at + middle)).abs() - 0.5 * size;
+        assert!(now <= before + 1e-5, "{}", place(i));
+        let far = beside.max(Vec3::ZERO).length();
+        assert!(far <= before.abs() || (now - before).abs() < 1e-5, "{}: {now} instead of {before}", place(i));
+        assert!(now >= 0.0 || before < 0.0 || far == 0.0, "{} is inside", place(i));
+        inside += usize::from(now < 0.0 && before >= 0.0);
+    }
+    assert!(inside > 30, "{inside} voxels inside the sofa");
+}
+
+/// Furniture of others on a floor that is a sheet; values as before.
+#[test]
+fn furniture_on_a_floor_as_open3d_has_it() {
+    let Some(dir) = furniture() else { return };
     let golden: Furnished = serde_json::from_slice(&std::fs::read(fixture("furnished.json")).unwrap()).unwrap();
     let mut mesh = TriMesh::new();
     let (object, material) = (mesh.add_object("floor"), mesh.add_material("wood", [1.0; 4]));

@@ -85,7 +85,7 @@ fn run(args: &Args) -> Result<u8> {
             }
             Ok(())
         })?;
-        println!("start {}: {}", p.start, outcome(p));
+        println!("start {}: {}", p.start, p.outcome());
     }
     tile(&plans, 4).write_png(args.out.join("paths.png"))?;
     println!("pictures in {}", args.out.display());
@@ -102,13 +102,4 @@ fn strips(episode: &Episode, body: &BodyModel, p: &Played, out: &std::path::Path
     panels.write_png(out.join(format!("start-{:03}-film.png", p.start)))?;
     episode.ghosts(body, 9, 1200, 700)?.write_png(out.join(format!("start-{:03}-ghosts.png", p.start)))?;
     Ok(())
-}
-
-fn outcome(p: &Played) -> String {
-    let how = match (p.figure("success") > 0.5, p.figure("penetration") > 0.5) {
-        (true, _) => "arrived",
-        (_, true) => "hit something",
-        _ => "ran out of time",
-    };
-    format!("{how} after {} steps, {:.2} m from the goal", p.figure("steps"), p.figure("final_dist"))
 }

@@ -57,6 +57,16 @@ impl Played {
     pub fn figure(&self, name: &str) -> f32 {
         EPISODE.iter().position(|&n| n == name).map_or(f32::NAN, |k| self.figures[k])
     }
+
+    /// How it ended, in words.
+    pub fn outcome(&self) -> String {
+        let how = match (self.figure("success") > 0.5, self.figure("penetration") > 0.5) {
+            (true, _) => "arrived",
+            (_, true) => "hit something",
+            _ => "ran out of time",
+        };
+        format!("{how} after {} steps, {:.2} m from the goal", self.figure("steps"), self.figure("final_dist"))
+    }
 }
 
 /// Sums over the steps of an episode under way.

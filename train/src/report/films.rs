@@ -2,7 +2,7 @@
 
 use super::runs::Stage;
 use crate::course::{last_levels, options};
-use crate::evaluate::{Actor, Played, play};
+use crate::evaluate::{Actor, play};
 use crate::html::Picture;
 use crate::registry::{Purpose, Registry};
 use crate::{Error, Result};
@@ -41,19 +41,10 @@ pub fn films(stage: &Stage, registry: &Registry, starts: usize) -> Result<Vec<(P
         plans.push(episode.top_view(body, PLAN)?);
         if pictures.is_empty() {
             let strip = episode.panels(body, 8, 8, 140, 180)?;
-            pictures.push((Picture::Png(strip.png()?), format!("Start {}: {}", p.start, outcome(p))));
+            pictures.push((Picture::Png(strip.png()?), format!("Start {}: {}", p.start, p.outcome())));
         }
     }
-    let all = played.iter().map(|p| format!("{} {}", p.start, outcome(p))).collect::<Vec<_>>().join("; ");
+    let all = played.iter().map(|p| format!("{} {}", p.start, p.outcome())).collect::<Vec<_>>().join("; ");
     pictures.push((Picture::Png(tile(&plans, ROW).png()?), format!("Ways from above, by row: {all}.")));
     Ok(pictures)
-}
-
-fn outcome(p: &Played) -> String {
-    let how = match (p.figure("success") > 0.5, p.figure("penetration") > 0.5) {
-        (true, _) => "arrived",
-        (_, true) => "hit something",
-        _ => "ran out of time",
-    };
-    format!("{how} after {} steps, {:.2} m from the goal", p.figure("steps"), p.figure("final_dist"))
 }

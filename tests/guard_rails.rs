@@ -1,7 +1,11 @@
 //! Numbers that are not finite stop a run, which says what they are of and what is left.
 
+#[path = "common/altered.rs"]
+mod altered;
+
+use altered::Altered;
+use egogen_envs::StepResult;
 use egogen_envs::point::PointGoal;
-use egogen_envs::{EnvError, EnvSpec, StepResult, VecEnv};
 use egogen_train::recipe::Recipe;
 use egogen_train::registry::{Made, Purpose, Registry};
 use egogen_train::trainer::Trainer;
@@ -12,55 +16,19 @@ use std::sync::atomic::AtomicBool;
 /// Spoils the result of a step.
 type Spoil = fn(&mut StepResult);
 
-/// A point's task whose steps from `at` (counted from 1) are spoilt; 0: none.
-struct Spoilt {
-    point: PointGoal,
-    step: u32,
-    at: u32,
-    spoil: Spoil,
-}
-
-impl VecEnv for Spoilt {
-    fn spec(&self) -> &EnvSpec {
-        self.point.spec()
-    }
-
-    fn num_envs(&self) -> usize {
-        self.point.num_envs()
-    }
-
-    fn reset(&mut self, seed: u64, obs: &mut Vec<f32>) -> Result<(), EnvError> {
-        self.point.reset(seed, obs)
-    }
-
-    fn step(&mut self, actions: &[f32], out: &mut StepResult) -> Result<(), EnvError> {
-        self.point.step(actions, out)?;
-        self.step += 1;
-        if self.at > 0 && self.step >= self.at {
-            (self.spoil)(out);
-        }
-        Ok(())
-    }
-
-    fn save_state(&self) -> Result<Vec<u8>, EnvError> {
-        self.point.save_state()
-    }
-
-    fn load_state(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        self.point.load_state(state)
-    }
-
-    fn observe(&self, obs: &mut Vec<f32>) -> Result<(), EnvError> {
-        self.point.observe(obs)
-    }
-}
-
 /// How a run of two epochs, 64 steps each, ends where the steps from `at` of the environments for `purpose` are spoilt.
 fn stopped(dir: &Path, purpose: Purpose, at: u32, spoil: Spoil) -> String {
     let mut registry = Registry::default();
     registry.add("point", move |_, n, made_for| {
         let at = if made_for == purpose { at } else { 0 };
-        let env = Box::new(Spoilt { point: PointGoal::new(n, 0), step: 0, at, spoil });
+        let mut step = 0;
+        let change = move |result: &mut StepResult| {
+            step += 1;
+            if at > 0 && step >= at {
+                spoil(result);
+            }
+        };
+        let env = Box::new(Altered { point: PointGoal::new(n, 0), change });
         Ok(Made { env, origin: BTreeMap::new() })
     });
     let sets = ["run.epochs=2", "run.epoch_steps=4096", "test.episodes=8", "test.every=1", "checkpoint.every=1"].map(String::from);

@@ -1,10 +1,13 @@
 //! Stages, curricula and selection, as a person uses them.
 
+#[path = "common/altered.rs"]
+mod altered;
 mod common;
 
+use altered::Altered;
 use common::{assert_same_run, column, program, read, stderr, succeed, train};
+use egogen_envs::StepResult;
 use egogen_envs::point::PointGoal;
-use egogen_envs::{EnvError, EnvSpec, StepResult, VecEnv};
 use egogen_train::checkpoint::Checkpoint;
 use egogen_train::recipe::Recipe;
 use egogen_train::registry::{Made, Registry};
@@ -222,37 +225,6 @@ fn runs_are_reported_on_one_page() {
 }
 
 /// The point with an option `bonus`, which is paid in every step.
-struct Paid {
-    point: PointGoal,
-    bonus: f32,
-}
-
-impl VecEnv for Paid {
-    fn spec(&self) -> &EnvSpec {
-        self.point.spec()
-    }
-    fn num_envs(&self) -> usize {
-        self.point.num_envs()
-    }
-    fn reset(&mut self, seed: u64, obs: &mut Vec<f32>) -> Result<(), EnvError> {
-        self.point.reset(seed, obs)
-    }
-    fn step(&mut self, actions: &[f32], out: &mut StepResult) -> Result<(), EnvError> {
-        self.point.step(actions, out)?;
-        out.reward.iter_mut().for_each(|r| *r += self.bonus);
-        Ok(())
-    }
-    fn save_state(&self) -> Result<Vec<u8>, EnvError> {
-        self.point.save_state()
-    }
-    fn load_state(&mut self, state: &[u8]) -> Result<(), EnvError> {
-        self.point.load_state(state)
-    }
-    fn observe(&self, obs: &mut Vec<f32>) -> Result<(), EnvError> {
-        self.point.observe(obs)
-    }
-}
-
 fn paid() -> Registry {
     let mut registry = Registry::default();
     registry.add("point", |options, n, _| {
@@ -260,7 +232,8 @@ fn paid() -> Registry {
         if bonus > 100.0 {
             return Err(egogen_train::Error::config(format!("env_options.bonus is {bonus}, expected at most 100")));
         }
-        Ok(Made { env: Box::new(Paid { point: PointGoal::new(n, 0), bonus: bonus as f32 }), origin: BTreeMap::new() })
+        let change = move |result: &mut StepResult| result.reward.iter_mut().for_each(|r| *r += bonus as f32);
+        Ok(Made { env: Box::new(Altered { point: PointGoal::new(n, 0), change }), origin: BTreeMap::new() })
     });
     registry
 }

@@ -92,6 +92,14 @@ impl SceneBundle {
         replace_folder(dir, |fresh| self.write_files(fresh, picture))
     }
 
+    /// The scene moved so that its floor is at z = 0.
+    pub fn on_floor(mut self) -> Self {
+        let floor = std::mem::take(&mut self.floor);
+        self.mesh.iter_mut().flat_map(|mesh| &mut mesh.vertices).for_each(|v| v.z -= floor);
+        self.sdf.iter_mut().for_each(|sdf| sdf.lowest.z -= floor);
+        self
+    }
+
     /// Refuses a folder that a bundle must not take the place of: all but a new one, an empty one, and a bundle with nothing else in it.
     pub fn check_target(dir: &Path) -> Result<()> {
         let bad = |what: String| Err(Error::file(dir, format!("{what}; give a new folder")));

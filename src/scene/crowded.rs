@@ -69,8 +69,9 @@ impl Default for CrowdedScenes {
 pub struct CrowdedScene {
     pub name: String,
     pub scene: Scene,
-    pub mesh: TriMesh,
-    pub sdf: SdfGrid,
+    /// None where it is not known.
+    pub mesh: Option<Arc<TriMesh>>,
+    pub sdf: Arc<SdfGrid>,
     depths: Depths,
     pub pairs: Vec<Pair>,
 }
@@ -126,26 +127,23 @@ impl CrowdedScene {
         let layout = SdfOptions { voxel, top: Some(REACH), ..SdfOptions::for_floor(&room.walkable, 0.0)? };
         let sdf = SdfGrid::build(&room.mesh, &layout)?;
         let (depths, scene) = (Depths::new(&sdf), Scene { walkable: room.walkable, obstacles: Vec::new() });
-        Ok(Self { name: room.name, scene, mesh: room.mesh, sdf, depths, pairs })
+        Ok(Self { name: room.name, scene, mesh: Some(Arc::new(room.mesh)), sdf: Arc::new(sdf), depths, pairs })
     }
 
     /// The scene of the bundle in the folder `dir`, with its floor at z = 0. Pairs without a way are left out.
     ///
     /// Errors: what [`SceneBundle::read`] refuses, and a bundle without distances or without pairs that a person can walk between.
     pub fn read(dir: &Path) -> Result<Self> {
-        let SceneBundle { name, floor, walkable, mesh, sdf, mut pairs, .. } = SceneBundle::read(dir)?;
+        let SceneBundle { name, walkable, mesh, sdf, mut pairs, .. } = SceneBundle::read(dir)?.on_floor();
         let lack =
             |what: &str, with: &str| Error::file(dir, format!("holds no {what}, which playing in it needs; make the scene with {with}"));
         pairs.retain(|p| p.way > 0.0);
         if pairs.is_empty() {
             return Err(lack("pairs with a way from start to goal", "--pairs-count"));
         }
-        let mut sdf = sdf.ok_or_else(|| lack("signed distances", "--voxel 0.05"))?;
-        let mut mesh = mesh.unwrap_or_default();
-        sdf.lowest.z -= floor;
-        mesh.vertices.iter_mut().for_each(|v| v.z -= floor);
+        let sdf = sdf.ok_or_else(|| lack("signed distances", "--voxel 0.05"))?;
         let (depths, scene) = (Depths::new(&sdf), Scene { walkable, obstacles: Vec::new() });
-        Ok(Self { name, scene, mesh, sdf, depths, pairs })
+        Ok(Self { name, scene, mesh: mesh.map(Arc::new), sdf: Arc::new(sdf), depths, pairs })
     }
 
     /// Look-ups of its distances.
@@ -213,7 +211,7 @@ mod tests {
         let scenes = config(&good, vec![bad.clone()]).make(Split::Validation).unwrap();
         let scene = &scenes[0];
         assert_eq!((scene.name.as_str(), scene.pairs.len(), scene.sdf.lowest.z), ("attic", 1, 0.5));
-        assert!(scene.mesh.bounds().unwrap().0.z.abs() < 0.02);
+        assert!(scene.mesh.as_ref().unwrap().bounds().unwrap().0.z.abs() < 0.02);
         let error = config(&good, vec![bad]).make(Split::Test).unwrap_err().to_string();
         assert!(error.contains("bad: holds no pairs") && error.contains("--pairs-count"), "{error}");
         assert!(config(Path::new("gone"), Vec::new()).make(Split::Train).unwrap_err().to_string().contains("gone"));

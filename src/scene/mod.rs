@@ -4,6 +4,8 @@ mod bundle;
 mod crowded;
 mod depths;
 #[cfg(test)]
+mod furniture;
+#[cfg(test)]
 mod fuzz;
 mod grid;
 mod make;

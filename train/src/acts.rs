@@ -1,6 +1,7 @@
 //! What a policy says of some observations, and the actions drawn from it.
 
 use egogen::agent::{choice_at, likeliest, log_prob_of, log_softmax_of};
+use egogen::metrics::{kl_mean_only, kl_to_standard};
 use egogen::rng::stream;
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
@@ -37,6 +38,13 @@ impl Acts {
 
     fn discrete(&self) -> bool {
         self.logvar.is_empty()
+    }
+
+    /// Of each row its divergences from N(0, I): the mean per-dimension KL, nats, and the authors' 0.5 mean(mu^2). None of discrete actions.
+    pub fn divergences(&self) -> Vec<[f32; 2]> {
+        let width = self.width();
+        let rows = self.mu.chunks_exact(width).zip(self.logvar.chunks_exact(width));
+        rows.map(|(mu, logvar)| [kl_to_standard(mu, logvar) / width as f32, kl_mean_only(mu)]).collect()
     }
 
     /// Drawn actions: mean + sigma x noise, or a choice; the draws of row i come from stream (seed, purpose, step x rows + i), with
@@ -87,6 +95,12 @@ impl Acts {
             }
         }
     }
+}
+
+/// Rows of standard normal noise, n x `width`; row i comes from stream (seed, purpose, step x n + i).
+pub fn normal_rows(n: usize, width: usize, seed: u64, purpose: &str, step: u64) -> Vec<f32> {
+    let row = |i: usize| StandardNormal.sample_iter(stream(seed, purpose, step * n as u64 + i as u64)).take(width);
+    (0..n).flat_map(row).collect()
 }
 
 #[cfg(test)]

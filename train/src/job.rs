@@ -58,7 +58,8 @@ impl Summary {
         let path = dir.join("summary.json");
         match std::fs::read_to_string(&path) {
             Ok(text) => Ok(Some(serde_json::from_str(&text).map_err(|e| egogen::Error::file(&path, e.to_string()))?)),
-            Err(_) => Ok(None),
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(None),
+            Err(e) => Err(egogen::Error::io(&path, e).into()),
         }
     }
 }

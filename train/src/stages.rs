@@ -119,7 +119,7 @@ fn resolve(recipe: &Recipe, i: usize, stage: &Stage) -> Result<Recipe> {
     let text = toml::to_string(&table).map_err(|e| bad(&e))?;
     let mut own: Recipe = toml::from_str(&text).map_err(|e| bad(&e))?;
     own.name = format!("{}-{}", recipe.name, stage.name);
-    own.seed = recipe.seed + SEEDS * i as u64;
+    own.seed = recipe.seed.wrapping_add(SEEDS * i as u64);
     Ok(own)
 }
 

@@ -92,12 +92,13 @@ fn run(args: &Args) -> Result<u8> {
         let head =
             json!({"name": s.name, "scenario": s, "task": setup.env.task(), "scenes": setup.solids.len(), "episodes": setup.place.len()});
         told.push(merged(head, json!({"rows": rows, "differences": others})));
+        // What is known so far, for what comes may take long.
+        let report = json!({"format": FORMAT, "seed": args.seed, "origin": world.origin(), "scenarios": told});
+        write_atomic(args.out.join("report.json"), format!("{report:#}").as_bytes())?;
+        write_atomic(args.out.join("report.md"), text.as_bytes())?;
     }
     println!("{text}");
     add_meanings(&mut page);
-    let report = json!({"format": FORMAT, "seed": args.seed, "origin": world.origin(), "scenarios": told});
-    write_atomic(args.out.join("report.json"), format!("{report:#}").as_bytes())?;
-    write_atomic(args.out.join("report.md"), text.as_bytes())?;
     write_atomic(args.out.join("report.html"), page.finish().as_bytes())?;
     Ok(0)
 }

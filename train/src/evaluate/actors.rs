@@ -1,19 +1,17 @@
 //! Who chooses the latents.
 
 use super::way::Way;
+use crate::acts::normal_rows;
 use crate::{Compute, Error, Policy, Result};
 use egogen::agent::ObsGroup;
 use egogen::agent::bundle::Bundle;
 use egogen::body::{JOINTS, canonical_frame, joint};
-use egogen::metrics::{kl_mean_only, kl_to_standard};
 use egogen::motion::{FUTURE, SEED};
-use egogen::rng::stream;
 use egogen::scene::Polygon;
 use egogen::sim::{People, Primitives};
 use egogen_envs::VecEnv;
 use egogen_envs::motion::{MotionEnv, blocked};
 use glam::{Vec2, Vec3};
-use rand_distr::{Distribution, StandardNormal};
 
 /// Stream of all noise in evaluation.
 const NOISE: &str = "evaluation noise";
@@ -73,15 +71,11 @@ impl Actor {
             Self::Policy { policy, noise, blind } => {
                 let acts = if *blind { policy.act(&blinded(env, obs))? } else { policy.act(obs)? };
                 let k = policy.actions();
-                let rows = || acts.mu.chunks_exact(k).zip(acts.logvar.chunks_exact(k));
-                Ok(Choice {
-                    kl: rows().map(|(mu, logvar)| kl_to_standard(mu, logvar) / k as f32).collect(),
-                    kl_mean: rows().map(|(mu, _)| kl_mean_only(mu)).collect(),
-                    latents: env.sim().widen(&if *noise { acts.sample(seed, NOISE, step) } else { acts.mu }, k)?,
-                })
+                let (kl, kl_mean) = acts.divergences().into_iter().map(|[kl, mean]| (kl, mean)).unzip();
+                Ok(Choice { kl, kl_mean, latents: env.sim().widen(&if *noise { acts.sample(seed, NOISE, step) } else { acts.mu }, k)? })
             }
             Self::Zero => Ok(Choice { latents: vec![0.0; people.len() * dim], ..Default::default() }),
-            Self::Prior => Ok(Choice { latents: normal(people.len(), dim, seed, step), ..Default::default() }),
+            Self::Prior => Ok(Choice { latents: normal_rows(people.len(), dim, seed, NOISE, step), ..Default::default() }),
             Self::Greedy(greedy) => Ok(Choice { latents: greedy.choose(env, playing, seed, step)?, ..Default::default() }),
         }
     }
@@ -94,12 +88,6 @@ fn blinded(env: &MotionEnv, obs: &[f32]) -> Vec<f32> {
     let rays = spec.obs.iter().find(|g| g.name == EGOSENSING).map_or(0, ObsGroup::len);
     out.chunks_exact_mut(spec.obs_dim()).for_each(|row| row[before..before + rays].fill(1.0));
     out
-}
-
-/// n rows of standard normal noise; row i of a step has a stream of its own.
-fn normal(n: usize, dim: usize, seed: u64, step: u64) -> Vec<f32> {
-    let row = |i: usize| StandardNormal.sample_iter(stream(seed, NOISE, step * n as u64 + i as u64)).take(dim);
-    (0..n).flat_map(row).collect()
 }
 
 /// One-step search: every latent is tried in the simulation, and judged by how far it leads along the shortest way round what stands still.
@@ -125,7 +113,8 @@ impl Greedy {
         for group in who.chunks(self.at_once) {
             let rows: Vec<usize> = group.iter().flat_map(|&i| std::iter::repeat_n(i, self.candidates)).collect();
             let mut people = env.people().select(&rows);
-            let latents: Vec<f32> = group.iter().flat_map(|&i| normal(self.candidates, dim, seed, step * n as u64 + i as u64)).collect();
+            let latents: Vec<f32> =
+                group.iter().flat_map(|&i| normal_rows(self.candidates, dim, seed, NOISE, step * n as u64 + i as u64)).collect();
             env.sim().step(&mut people, &latents, &mut prims)?;
             for (g, &i) in group.iter().enumerate() {
                 let setting = env.setting(i);

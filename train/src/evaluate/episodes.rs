@@ -87,7 +87,7 @@ pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Resu
     let mut running = vec![Running::default(); n];
     let mut done: Vec<Option<Played>> = vec![None; n];
     for (i, r) in running.iter_mut().enumerate() {
-        let room = env.room(i).filter(|room| record && !room.mesh.triangles.is_empty()).map(|room| Arc::new(room.mesh.clone()));
+        let room = env.room(i).and_then(|room| room.mesh.clone());
         let betas = env.people().betas[i * BETAS..(i + 1) * BETAS].to_vec();
         r.film = Film { frames: vec![], betas, setting: env.setting(i).clone(), room };
     }

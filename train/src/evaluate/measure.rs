@@ -152,7 +152,7 @@ fn clear(floor: &Polygon, pelvis: Vec2) -> bool {
 }
 
 fn room(solids: Option<&Solids>, v: Vec3) -> f32 {
-    solids.map_or(f32::INFINITY, |s| s.sdf.at(v + s.floor * Vec3::Z))
+    solids.map_or(f32::INFINITY, |s| s.sdf.at(v))
 }
 
 /// Of each person of a scene: share of its frames inside others, vertices inside them and occupancy, means over the frames.

@@ -18,20 +18,17 @@ use std::sync::Arc;
 /// First two shape coefficients of a male-like and a female-like body (see the body's card).
 const BUILDS: [[f32; 2]; 2] = [[1.0, -1.0], [-1.0, 1.0]];
 
-/// What stands in a room.
+/// What stands in a room, whose floor is at z = 0.
 #[derive(Clone)]
 pub struct Solids {
     pub sdf: Arc<SdfGrid>,
-    /// For pictures; its floor at z = 0.
+    /// For pictures, where it is known.
     pub mesh: Option<Arc<TriMesh>>,
-    /// Height in `sdf` of the floor on which people walk at z = 0, metres.
-    pub floor: f32,
 }
 
 impl Solids {
     fn of(room: &CrowdedScene) -> Self {
-        let mesh = (!room.mesh.triangles.is_empty()).then(|| Arc::new(room.mesh.clone()));
-        Self { sdf: Arc::new(room.sdf.clone()), mesh, floor: 0.0 }
+        Self { sdf: room.sdf.clone(), mesh: room.mesh.clone() }
     }
 }
 
@@ -137,18 +134,14 @@ impl<'a> Source<'a> {
                 Self::Rooms { people: *people, rooms: furnished.collect() }
             }
             Layout::Bundle { people, path } => {
-                let bundle = SceneBundle::read(path).given()?;
+                let bundle = SceneBundle::read(path).given()?.on_floor();
                 if bundle.pairs.is_empty() {
                     let what = format!("{} holds no pairs of start and goal; make it again with `scene`", path.display());
                     return Err(Error::config(what));
                 }
                 let pairs = bundle.pairs.iter().map(|p| [p.start, p.goal]).collect();
-                let mut mesh = bundle.mesh;
-                if let Some(mesh) = &mut mesh {
-                    mesh.vertices.iter_mut().for_each(|v| v.z -= bundle.floor);
-                }
-                let mesh = mesh.map(Arc::new);
-                let solids = bundle.sdf.map(|sdf| Solids { sdf: Arc::new(sdf), mesh, floor: bundle.floor });
+                let mesh = bundle.mesh.map(Arc::new);
+                let solids = bundle.sdf.map(|sdf| Solids { sdf: Arc::new(sdf), mesh });
                 let scene = Scene { walkable: bundle.walkable, obstacles: Vec::new() };
                 Self::Rooms { people: *people, rooms: vec![Furnished { scene, solids, pairs }] }
             }

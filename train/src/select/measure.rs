@@ -1,16 +1,15 @@
 //! What selection measures of a policy on its starts.
 
 use super::rule::Quality;
+use crate::acts::normal_rows;
 use crate::collector::{Player, first_episodes};
 use crate::evaluate::{Estimate, mean, proportion};
 use crate::{Error, Policy, Result};
 use egogen::body::{BETAS, MARKER_DIM, PARAMS};
-use egogen::metrics::{kl_mean_only, kl_to_standard, rigid_marker_error};
+use egogen::metrics::rigid_marker_error;
 use egogen::motion::{FRAMES, PosePrior, SEED};
-use egogen::rng::stream;
 use egogen_envs::motion::MotionEnv;
 use egogen_envs::{ActionSpace, VecEnv};
-use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::any::Any;
@@ -61,7 +60,7 @@ struct Watched<'a> {
     steps: Vec<f64>,
     sums: Vec<[f64; 4]>,
     /// Divergences of the actions of the present step; empty where there are none.
-    divergences: Vec<[f64; 2]>,
+    divergences: Vec<[f32; 2]>,
 }
 
 /// Looks at bodies in the motion task.
@@ -82,24 +81,17 @@ impl Player for Watched<'_> {
         match self.actor {
             Actor::Policy { policy, noise } => {
                 let acts = policy.act(obs)?;
-                let width = policy.actions();
-                let rows = acts.mu.chunks_exact(width).zip(acts.logvar.chunks_exact(width));
-                let of = |(mu, logvar)| [kl_to_standard(mu, logvar) / width as f32, kl_mean_only(mu)].map(f64::from);
-                self.divergences = rows.map(of).collect();
+                self.divergences = acts.divergences();
                 Ok(if noise { acts.sample(self.seed, NOISE, step) } else { acts.best() })
             }
-            Actor::Prior(width) => {
-                let n = self.steps.len() as u64;
-                let row = |i: u64| StandardNormal.sample_iter(stream(self.seed, NOISE, step * n + i)).take(width);
-                Ok((0..n).flat_map(row).collect())
-            }
+            Actor::Prior(width) => Ok(normal_rows(self.steps.len(), width, self.seed, NOISE, step)),
         }
     }
 
     fn look(&mut self, env: &dyn VecEnv, playing: &[usize]) {
         let bodies = self.judge.as_ref().zip(as_motion(env)).map(|(judge, motion)| judge.look(motion, playing));
         for (k, &i) in playing.iter().enumerate() {
-            let [full, mean] = self.divergences.get(i).copied().unwrap_or_default();
+            let [full, mean] = self.divergences.get(i).copied().unwrap_or_default().map(f64::from);
             let [pose, bones] = bodies.as_ref().map_or([0.0; 2], |b| b[k]);
             self.sums[i].iter_mut().zip([full, mean, pose, bones]).for_each(|(sum, x)| *sum += x);
             self.steps[i] += 1.0;

@@ -111,7 +111,8 @@ impl Manifest {
         let result = train(task, &dir, registry, threads, stop);
         let failed = dir.join(failed_file(task));
         match &result {
-            Err(e) => write_atomic(&failed, format!("{e}\n").as_bytes())?,
+            // Where even this cannot be written, the error itself is still told.
+            Err(e) => drop(write_atomic(&failed, format!("{e}\n").as_bytes())),
             Ok(_) if failed.exists() => std::fs::remove_file(&failed).map_err(|e| egogen::Error::io(&failed, e))?,
             Ok(_) => {}
         }

@@ -2,7 +2,6 @@ use super::*;
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
-use std::process::Command;
 
 fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/scenes").join(name)
@@ -43,14 +42,7 @@ fn small_files_as_others_read_them() {
 
 #[test]
 fn furniture_as_others_read_it() {
-    let shared = std::env::var_os("EGOGEN_SHARED").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"), PathBuf::from);
-    let archive = shared.join("data/scenes.tar.gz");
-    if !archive.is_file() {
-        println!("skipped: no {} (set EGOGEN_SHARED)", archive.display());
-        return;
-    }
-    let dir = tempfile::tempdir().unwrap();
-    assert!(Command::new("tar").arg("xzf").arg(archive).arg("-C").arg(dir.path()).status().unwrap().success());
+    let Some(dir) = crate::scene::furniture::unpacked() else { return };
     for (name, want) in &json("furniture.json") {
         // Where slivers and equal places end depends on rounding.
         same(&read_mesh(dir.path().join("scenes").join(name), &AS_IT_IS).unwrap().mesh, want, 2e-3, name);

@@ -57,12 +57,16 @@ fn scenarios_make_one_report() {
     assert_eq!((&mine["name"], &mine["scenes"], &mine["episodes"]), (&"mine".into(), &2.into(), &4.into()));
     assert_eq!((midpoint["scenes"].as_u64(), midpoint["rows"].as_array().unwrap().len()), (Some(10), 3));
     assert!(mine["rows"][0]["inside_frames"]["high"].is_f64() && midpoint["rows"][0]["inside_frames"].is_null());
+    // Everyone's end is counted, and boxes can be walked through.
+    let ends = |row: &serde_json::Value| row["fates"].as_array().unwrap().iter().map(|f| f[1].as_u64().unwrap()).sum::<u64>();
+    assert!(midpoint["rows"].as_array().unwrap().iter().all(|row| Some(ends(row)) == midpoint["episodes"].as_u64()));
+    assert!(midpoint["rows"][0]["most_inside"]["value"].is_f64() && mine["rows"][0]["most_inside"].is_null());
     // Ten ways of the stochastic policy differ, of the deterministic one they do not.
     let spread = |row: usize| midpoint["rows"][row]["path_distance"]["value"].as_f64().unwrap();
     assert!(spread(0) > 0.01 && spread(1) == 0.0, "{} {}", spread(0), spread(1));
     assert_eq!(mine["differences"].as_array().unwrap().len(), 2);
     let html = read("report.html");
-    for part in ["<svg", "data:image/png;base64,", "vertices in others", "no egosensing", "side entropy"] {
+    for part in ["<svg", "data:image/png;base64,", "vertices in others", "How episodes ended", "no egosensing", "side entropy"] {
         assert!(html.contains(part), "{part}");
     }
     assert!(!html.contains("src=\"http") && !html.contains("href") && !html.contains("<script"), "needs nothing else");

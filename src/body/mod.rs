@@ -12,7 +12,7 @@ mod surface;
 pub use frame::{Frame, canonical_frame};
 pub use model::BodyModel;
 pub use shaped::{Posed, ShapedBody, local_rotations};
-pub use surface::{Inside, Moving, Obstacles, Points, ShapedSurface, Surface};
+pub use surface::{Inside, Moving, Obstacles, Points, ShapedSurface, Surface, smplx_weights};
 
 use crate::{Error, Result};
 use std::ops::Range;

@@ -72,7 +72,7 @@ pub struct Inside {
 impl Surface {
     /// The points of `model`.
     pub fn new(model: &Arc<BodyModel>, which: Points) -> Self {
-        let weights = weights(model);
+        let weights = smplx_weights(model);
         let (mut rest, mean) = (Vec::new(), model.shape(&[0.0; super::BETAS]));
         model.rest_vertices(mean.betas(), &mut rest);
         let joints: Vec<Vec3> = mean.rest_bones().collect();
@@ -259,8 +259,8 @@ fn as_points(floats: &[f32]) -> [Vec3; JOINTS] {
     std::array::from_fn(|k| Vec3::from_slice(&floats[3 * k..]))
 }
 
-/// SMPL-X vertices that each vertex stands for; 0 on the feet.
-fn weights(model: &BodyModel) -> Vec<f32> {
+/// Number of SMPL-X vertices that each vertex stands for, 0 on the feet; see [`Surface`].
+pub fn smplx_weights(model: &BodyModel) -> Vec<f32> {
     let mut foot = vec![false; model.vertex_count()];
     model.foot_vertices().iter().for_each(|&v| foot[v] = true);
     if model.vertex_count() == SMPLX {

@@ -4,7 +4,7 @@ use crate::body::BETAS;
 
 /// Depth and count over all vertices, one by one.
 fn brute(model: &BodyModel, body: &ShapedBody, posed: &Posed, to_world: &Frame, distance: impl Fn(Vec3) -> f32) -> Inside {
-    let (mut vertices, weights) = (Vec::new(), weights(model));
+    let (mut vertices, weights) = (Vec::new(), smplx_weights(model));
     model.skin(body, posed, &mut vertices);
     vertices.iter().zip(weights).fold(Inside::default(), |sum, (v, w)| {
         let d = distance(to_world.point(*v)).min(0.0);
@@ -23,7 +23,7 @@ fn boxed(c: Vec3, h: Vec3) -> impl Fn(Vec3) -> f32 {
 #[test]
 fn weights_make_the_vertices_of_smplx() {
     let model = BodyModel::embedded();
-    let total: f32 = weights(&model).iter().sum();
+    let total: f32 = smplx_weights(&model).iter().sum();
     assert!((total - (10475.0 - 502.0)).abs() < 1.0, "{total}");
     for points in [Points::All, Points::Spread(800)] {
         let surface = Surface::new(&model, points);

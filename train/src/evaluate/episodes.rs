@@ -1,6 +1,6 @@
 //! Plays each start once and measures it.
 
-use super::{Actor, Measured};
+use super::{Actor, Fate, Measured};
 use crate::{Error, Result};
 use egogen::body::{BETAS, MARKER_DIM, PARAMS};
 use egogen::metrics::stance_slide;
@@ -46,6 +46,8 @@ pub struct Played {
     pub kl_mean: f32,
     /// steps x 9 weighted reward terms, in the order of [`TERMS`].
     pub terms: Vec<f32>,
+    /// Whether a penetration ended it.
+    pub stopped: bool,
     /// The motion, where it was asked for.
     pub film: Option<Film>,
     /// What the motion tells, where it was looked at.
@@ -60,11 +62,7 @@ impl Played {
 
     /// How it ended, in words.
     pub fn outcome(&self) -> String {
-        let how = match (self.figure("success") > 0.5, self.figure("penetration") > 0.5) {
-            (true, _) => "arrived",
-            (_, true) => "hit something",
-            _ => "ran out of time",
-        };
+        let how = Fate::of(self).words();
         format!("{how} after {} steps, {:.2} m from the goal", self.figure("steps"), self.figure("final_dist"))
     }
 }
@@ -81,7 +79,7 @@ struct Running {
 /// The first episode of every environment of `env` (one start each, numbered from 0) with `actor`. `record` keeps the motion.
 pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Result<Vec<Played>> {
     let n = env.num_envs();
-    let (prior, width) = (PosePrior::embedded()?, env.spec().info.len());
+    let (prior, width, ends) = (PosePrior::embedded()?, env.spec().info.len(), env.task().end_on_penetration);
     let (mut obs, mut result) = (Vec::new(), StepResult::default());
     env.reset(seed, &mut obs)?;
     let mut running = vec![Running::default(); n];
@@ -100,7 +98,9 @@ pub fn play(env: &mut MotionEnv, actor: &Actor, seed: u64, record: bool) -> Resu
             running[i].terms.extend_from_slice(&result.info[i * width..][..TERMS.len()]);
             if result.terminated[i] || result.truncated[i] {
                 let figures = result.episode[i * EPISODE.len()..].first_chunk().copied().unwrap_or_default();
-                done[i] = Some(std::mem::take(&mut running[i]).finish(i, figures, record));
+                let mut played = std::mem::take(&mut running[i]).finish(i, figures, record);
+                played.stopped = ends && played.figure("penetration") > 0.5;
+                done[i] = Some(played);
             }
         }
         if done.iter().all(Option::is_some) {
@@ -136,7 +136,7 @@ impl Running {
     fn finish(self, person: usize, figures: [f32; EPISODE.len()], record: bool) -> Played {
         let [body_error, pose_norm, slide, kl, kl_mean] = self.sums.map(|s| s / self.steps);
         let (start, group, film) = (person as u64, person, record.then_some(self.film));
-        Played { person, start, group, figures, body_error, pose_norm, slide, kl, kl_mean, terms: self.terms, film, measured: None }
+        Played { person, start, group, figures, body_error, pose_norm, slide, kl, kl_mean, terms: self.terms, film, ..Default::default() }
     }
 }
 

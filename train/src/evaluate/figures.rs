@@ -1,6 +1,6 @@
 //! What is told of episodes: every figure with its name, unit and meaning.
 
-use super::{Estimate, Played, ratio, share};
+use super::{Estimate, Fate, Played, THROUGH, ratio, share};
 use egogen::metrics::{entropy, pairwise_path_distance};
 use glam::Vec2;
 use serde::Serialize;
@@ -44,7 +44,7 @@ fn told(p: &Played, of: fn(&super::Measured) -> f32) -> f32 {
 }
 
 /// All figures of an episode, in the order of tables.
-pub const FIGURES: [Figure; 23] = [
+pub const FIGURES: [Figure; 25] = [
     figure!(
         "success",
         "success %",
@@ -53,6 +53,15 @@ pub const FIGURES: [Figure; 23] = [
         1,
         |p| p.figure("success"),
         "arrived: pelvis within 0.1 m of the goal, in space, at the end of a step; where a penetration ends episodes, without one"
+    ),
+    figure!(
+        "clean",
+        "clean %",
+        More,
+        true,
+        1,
+        |p| told(p, |m| if m.most_inside.is_finite() { f32::from(m.most_inside < THROUGH) } else { f32::NAN }) * p.figure("success"),
+        "arrived with never 40 or more vertices inside an obstacle (eq. 11)"
     ),
     figure!(
         "reached",
@@ -101,6 +110,15 @@ pub const FIGURES: [Figure; 23] = [
         1,
         |p| 1000.0 * told(p, |m| m.obstacle_depth),
         "depth of the deepest vertex inside obstacles, by signed distance, mean over all frames"
+    ),
+    figure!(
+        "most_inside",
+        "most inside",
+        Less,
+        false,
+        0,
+        |p| told(p, |m| m.most_inside),
+        "greatest number of vertices inside obstacles in a frame, counted as SMPL-X's, without feet; eq. 11 forbids 40"
     ),
     figure!(
         "inside_frames",
@@ -178,8 +196,11 @@ pub const OF_STARTS: [(&str, &str, &str); 2] = [
 
 /// Tables, and the figures that each shows.
 const PARTS: [(&str, &[&str]); 3] = [
-    ("The goal", &["success", "reached", "near", "seconds", "final_xy", "min_xy", "detour", "path_distance", "side_entropy"]),
-    ("Obstacles and others", &["penetration", "obstacle_frames", "obstacle_depth_mm", "inside_frames", "inside_vertices", "occupancy"]),
+    ("The goal", &["success", "clean", "reached", "near", "seconds", "final_xy", "min_xy", "detour", "path_distance", "side_entropy"]),
+    (
+        "Obstacles and others",
+        &["penetration", "obstacle_frames", "obstacle_depth_mm", "most_inside", "inside_frames", "inside_vertices", "occupancy"],
+    ),
     ("Motion", &["contact", "slide_cm", "pose_norm", "body_error_mm", "kl", "kl_mean", "steps", "hover", "reward"]),
 ];
 
@@ -188,6 +209,8 @@ const PARTS: [(&str, &[&str]); 3] = [
 pub struct Row {
     pub name: String,
     pub episodes: usize,
+    /// How many of them ended in each way.
+    pub fates: Vec<(Fate, usize)>,
     /// By the names of [`FIGURES`] and [`OF_STARTS`]; those that apply.
     #[serde(flatten)]
     pub figures: BTreeMap<&'static str, Estimate>,
@@ -200,7 +223,9 @@ impl Row {
         for ((key, ..), value) in OF_STARTS.iter().zip(diversity(played)) {
             figures.extend(value.map(|v| (*key, v)));
         }
-        Self { name: name.into(), episodes: played.len(), figures }
+        let fates: Vec<Fate> = played.iter().map(Fate::of).collect();
+        let fates = Fate::ALL.map(|fate| (fate, fates.iter().filter(|f| **f == fate).count())).to_vec();
+        Self { name: name.into(), episodes: played.len(), fates, figures }
     }
 
     /// The figure `key`, if it applies.
@@ -304,7 +329,20 @@ pub fn table(rows: &[Row]) -> String {
         }
         text.push('\n');
     }
-    text
+    text + &fates(rows)
+}
+
+/// How many episodes ended in each way, as a Markdown table.
+fn fates(rows: &[Row]) -> String {
+    let mut text = format!(
+        "| How episodes ended |{}\n|---|{}\n",
+        Fate::ALL.map(|f| format!(" {} |", f.words())).concat(),
+        "---|".repeat(Fate::ALL.len())
+    );
+    for row in rows {
+        text += &format!("| {} |{}\n", row.name, row.fates.iter().map(|(_, n)| format!(" {n} |")).collect::<String>());
+    }
+    text + "\n"
 }
 
 #[cfg(test)]

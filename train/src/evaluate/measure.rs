@@ -2,7 +2,7 @@
 
 use super::way::Way;
 use super::{Film, Played, Setup, Solids};
-use egogen::body::{BodyModel, MARKER_DIM, PARAMS, ShapedBody, joint};
+use egogen::body::{BodyModel, MARKER_DIM, PARAMS, ShapedBody, joint, smplx_weights};
 use egogen::metrics::{
     box_distance, contact_score, deepest, final_distance, least_distance, meets_outline, occupancy, passes_left, path_length,
     time_to_reach, vertices_inside,
@@ -44,6 +44,8 @@ pub struct Measured {
     pub obstacle_frames: f32,
     /// Depth of the deepest vertex inside what stands or moves there, mean over the frames, metres.
     pub obstacle_depth: f32,
+    /// Greatest number of vertices inside in a frame, counted as SMPL-X's, without feet (eq. 11).
+    pub most_inside: f32,
     /// Share of the frames with any vertex inside another person; mean number of such vertices; mean occupancy there.
     pub inside_frames: f32,
     pub inside_vertices: f32,
@@ -57,6 +59,8 @@ struct Track<'a> {
     model: &'a BodyModel,
     shaped: ShapedBody,
     film: &'a Film,
+    /// SMPL-X vertices that each vertex stands for.
+    weights: &'a [f32],
 }
 
 impl Track<'_> {
@@ -84,7 +88,9 @@ impl Track<'_> {
 pub fn measure(setup: &Setup, played: &mut [Played]) {
     let model: &BodyModel = setup.env.sim().body();
     let films: Vec<&Film> = played.iter().filter_map(|p| p.film.as_ref()).collect();
-    let tracks: Vec<Track> = films.into_iter().map(|film| Track { model, shaped: model.shape(&film.betas), film }).collect();
+    let weights = smplx_weights(model);
+    let tracks: Vec<Track> =
+        films.into_iter().map(|film| Track { model, shaped: model.shape(&film.betas), film, weights: &weights }).collect();
     if tracks.len() != setup.place.len() {
         return;
     }
@@ -103,7 +109,7 @@ fn alone(setup: &Setup, i: usize, track: &Track) -> Measured {
     track.shaped.markers_batch(&film.frames, &mut markers);
     let near = least_distance(&path, goal) < NEAR;
     let shortest = Way::plan(walkable, path[0], goal).length();
-    let [obstacle_frames, obstacle_depth] = obstacles(setup, i, track, &path);
+    let [obstacle_frames, obstacle_depth, most_inside] = obstacles(setup, i, track, &path);
     let middle = film.setting.scene.obstacles.first().map(|b| b.centre);
     Measured {
         seconds: time_to_reach(&path, goal, AT).unwrap_or(f32::NAN),
@@ -114,22 +120,23 @@ fn alone(setup: &Setup, i: usize, track: &Track) -> Measured {
         detour: if near { path_length(&path) / shortest } else { f32::NAN },
         obstacle_frames,
         obstacle_depth,
+        most_inside,
         left: middle.and_then(|middle| passes_left(&path, goal, middle)),
         path,
         ..Measured::default()
     }
 }
 
-/// Share of frames over an obstacle's outline, and mean depth of the deepest vertex.
-fn obstacles(setup: &Setup, i: usize, track: &Track, path: &[Vec2]) -> [f32; 2] {
+/// Share of frames over an obstacle's outline, mean depth of the deepest vertex, and most vertices inside.
+fn obstacles(setup: &Setup, i: usize, track: &Track, path: &[Vec2]) -> [f32; 3] {
     let scene = &track.film.setting.scene;
     let place = setup.place[i];
     let movers: &[Mover] = setup.env.cast().map_or(&[], |cast| &cast.places[place].movers);
     let solids = setup.solids[place].as_ref();
     if scene.obstacles.is_empty() && movers.is_empty() && solids.is_none() {
-        return [f32::NAN; 2];
+        return [f32::NAN; 3];
     }
-    let (mut over, mut depth, mut count) = (0.0, 0.0, 0.0);
+    let (mut over, mut depth, mut most, mut count) = (0.0, 0.0, 0.0, 0.0);
     for t in (0..track.len()).step_by(EVERY) {
         let boxes: Vec<BoxObstacle> = movers.iter().map(|m| m.at(t as f32 / FPS)).chain(scene.obstacles.iter().copied()).collect();
         let moving = boxes[..movers.len()].iter().map(|b| b.corners().to_vec());
@@ -141,9 +148,13 @@ fn obstacles(setup: &Setup, i: usize, track: &Track, path: &[Vec2]) -> [f32; 2] 
         }
         let vertices = track.vertices(t);
         over += f32::from(meets_outline(&vertices, floor));
-        depth += deepest(&vertices, |v| boxes.iter().map(|b| box_distance(b, v)).fold(room(solids, v), f32::min));
+        let distances: Vec<f32> =
+            vertices.iter().map(|&v| boxes.iter().map(|b| box_distance(b, v)).fold(room(solids, v), f32::min)).collect();
+        depth += deepest(&distances);
+        let weights = track.weights.iter().zip(&distances);
+        most = f32::max(most, weights.filter(|(_, d)| **d < 0.0).map(|(w, _)| w).sum());
     }
-    [over / count, depth / count]
+    [over / count, depth / count, most]
 }
 
 /// Whether nothing is in reach of a person here.

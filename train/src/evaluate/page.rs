@@ -1,8 +1,8 @@
 //! What an evaluation found, as one HTML page.
 
 use super::figures::{Better, Column, FIGURES, OF_STARTS, parts};
-use super::pictures::{plans, worst};
-use super::{Estimate, Played, Row, Setup};
+use super::pictures::{failures, plans, worst};
+use super::{Estimate, Fate, Played, Row, Setup};
 use crate::Result;
 use crate::html::{Cell, Page, Picture};
 use crate::plot::{Series, Titles, histogram, lines};
@@ -12,6 +12,8 @@ use std::collections::BTreeMap;
 
 /// Filmstrips of each scenario.
 const WORST: usize = 3;
+/// Most failures on the contact sheet of a scenario.
+const FAILURES: usize = 16;
 /// Bins of histograms.
 const BINS: usize = 24;
 /// Figures that differences are shown of.
@@ -43,6 +45,10 @@ pub fn add_scenario(page: &mut Page, o: &Outcome) -> Result<()> {
         let rows = o.rows.iter().map(|row| std::iter::once(row.name.as_str().into()).chain(shown.iter().map(|c| cell(row, c))).collect());
         page.table(&head, &rows.collect::<Vec<Vec<Cell>>>());
     }
+    let head: Vec<&str> = std::iter::once("How episodes ended").chain(Fate::ALL.map(Fate::words)).collect();
+    let counts = |row: &Row| row.fates.iter().map(|(_, n)| Cell::from(n.to_string())).collect::<Vec<_>>();
+    let rows = o.rows.iter().map(|row| std::iter::once(row.name.as_str().into()).chain(counts(row)).collect());
+    page.table(&head, &rows.collect::<Vec<Vec<Cell>>>());
     compare(page, o);
     let mut figures = vec![distances(o)?, rewards(o)?];
     figures.extend(histograms(o)?);
@@ -54,6 +60,10 @@ pub fn add_scenario(page: &mut Page, o: &Outcome) -> Result<()> {
         }
     }
     page.figures(&views);
+    if let Some((image, caption)) = failures(o.setup, &o.played[o.reference], FAILURES)? {
+        page.text(&format!("Episodes of {} that failed:", o.rows[o.reference].name));
+        page.figures(&[(Picture::Png(image.png()?), caption.as_str())]);
+    }
     let strips = worst(o.setup, &o.played[o.reference], WORST)?;
     page.text(&format!("The worst episodes of {}, from the first to the last frame:", o.rows[o.reference].name));
     for (image, caption) in strips {

@@ -1,6 +1,6 @@
 //! Episodes of a scenario in pictures and as motion for other programs.
 
-use super::{Played, Setup};
+use super::{Fate, Played, Setup};
 use crate::Result;
 use egogen::body::PARAMS;
 use egogen::export::write_glb;
@@ -103,17 +103,24 @@ pub fn worst(setup: &Setup, played: &[Played], most: usize) -> Result<Vec<(Image
     Ok(out)
 }
 
-fn told(p: &Played, place: usize) -> String {
-    let how = if p.figure("success") > 0.5 { "arrived" } else { "did not arrive" };
-    let mut text = format!(
-        "scene {place}, person {}: {how}, {:.2} m from the goal after {} steps",
-        p.person,
-        p.figure("final_dist"),
-        p.figure("steps")
-    );
-    if p.figure("penetration") > 0.5 {
-        text += ", hit something";
+/// A contact sheet: from above the first `most` episodes that did not arrive, or only through something; and how each ended.
+pub fn failures(setup: &Setup, played: &[Played], most: usize) -> Result<Option<(Image, String)>> {
+    let body = setup.env.sim().body();
+    let failed = |p: &&Played| Fate::of(p) != Fate::Arrived;
+    let (mut images, mut captions) = (Vec::new(), Vec::new());
+    for p in played.iter().filter(failed).take(most) {
+        if let Some(image) = together(setup, played, &[p.person], |e| e.top_view(body, PLAN))? {
+            images.push(image);
+            captions.push(told(p, setup.place[p.person]));
+        }
     }
+    let all = played.iter().filter(failed).count();
+    let caption = format!("{} of {all}, row by row. {}.", images.len(), captions.join(". "));
+    Ok((!images.is_empty()).then(|| (tile(&images, 4), caption)))
+}
+
+fn told(p: &Played, place: usize) -> String {
+    let mut text = format!("Scene {place}, person {}: {}", p.person, p.outcome());
     if let Some(m) = p.measured.as_ref().filter(|m| m.inside_frames > 0.0) {
         text += &format!(", inside others in {:.0} % of the frames", 100.0 * m.inside_frames);
     }

@@ -1,22 +1,21 @@
 //! A scenario ready to be played: people placed in their scenes.
 
-use super::scenario::{Layout, Looks, Moving, Scenario};
+use super::people::{Start, first_poses, stands_free};
+use super::scenario::{Layout, Moving, Scenario};
 use super::{Actor, Played, measure, play};
 use crate::program::Given;
 use crate::{Error, Result};
-use egogen::body::{BETAS, MARKER_DIM, PARAMS, TRANSL};
 use egogen::rng::{Stream, stream};
 use egogen::scene::{BoxObstacle, CrowdedScene, Scene, SceneBundle, SdfGrid, Split, TriMesh};
-use egogen::sim::{SeedMotion, World};
+use egogen::sim::World;
 use egogen_envs::motion::{Cast, MotionEnv, MotionTask, Mover, Place, Role};
-use glam::{Vec2, Vec3};
+use glam::Vec2;
 use rand::RngExt;
-use rand_distr::{Distribution, StandardNormal};
 use std::f32::consts::TAU;
 use std::sync::Arc;
 
-/// First two shape coefficients of a male-like and a female-like body (see the body's card).
-const BUILDS: [[f32; 2]; 2] = [[1.0, -1.0], [-1.0, 1.0]];
+/// Starts that are tried until everybody stands free.
+const DRAWS: usize = 1000;
 
 /// What stands in a room, whose floor is at z = 0.
 #[derive(Clone)]
@@ -67,8 +66,7 @@ impl Setup {
         let (mut place, mut start, mut solids) = (Vec::new(), Vec::new(), Vec::new());
         for k in 0..scenario.scenes {
             let rng = &mut stream(seed, "scenario", k as u64);
-            let drawn = source.draw(rng)?;
-            let people = first_poses(&scenario.people, drawn.pairs.len(), world, rng)?;
+            let (drawn, people) = on_their_marks(&source, &scenario, world, rng)?;
             for _ in 0..scenario.repeats {
                 let at = cast.places.len();
                 for (j, ([from, to], (seed, turn))) in drawn.pairs.iter().zip(&people).enumerate() {
@@ -100,6 +98,19 @@ impl Setup {
         self.place.iter().enumerate().for_each(|(i, &p)| out[p].push(i));
         out
     }
+}
+
+/// A scene whose people stand clear of what stands there.
+fn on_their_marks(source: &Source, scenario: &Scenario, world: &World, rng: &mut Stream) -> Result<(Drawn, Vec<Start>)> {
+    for _ in 0..DRAWS {
+        let drawn = source.draw(rng)?;
+        let people = first_poses(&scenario.people, drawn.pairs.len(), world, rng)?;
+        let free = |sdf: &SdfGrid| drawn.pairs.iter().zip(&people).all(|(pair, person)| stands_free(person, *pair, sdf, world));
+        if drawn.solids.as_ref().is_none_or(|s| free(&s.sdf)) {
+            return Ok((drawn, people));
+        }
+    }
+    Err(Error::config(format!("scenario '{}': nobody stands free at {DRAWS} starts: give the pairs more clearance", scenario.name)))
 }
 
 /// Where scenes come from.
@@ -180,38 +191,6 @@ impl<'a> Source<'a> {
     }
 }
 
-/// First pose and shape of the `n` people of a scene, and how far they are turned away from their goals, radians.
-fn first_poses(looks: &Looks, n: usize, world: &World, rng: &mut Stream) -> Result<Vec<(SeedMotion, f32)>> {
-    let bank = &world.held_out.seeds;
-    let build = if looks.builds { BUILDS[rng.random_range(0..2)] } else { [0.0; 2] };
-    let noise = looks.turn_deg.to_radians();
-    let mut person = || {
-        let mut seed = bank[rng.random_range(0..bank.len())].clone();
-        let turn = rng.random_range(-noise..=noise);
-        if looks.builds || looks.shape > 0.0 {
-            let mut betas = [0.0; BETAS];
-            betas[..2].copy_from_slice(&build);
-            betas.iter_mut().for_each(|b| *b += looks.shape * Distribution::<f32>::sample(&StandardNormal, rng));
-            reshape(&mut seed, betas, world);
-        }
-        (seed, turn)
-    };
-    Ok((0..n).map(|_| person()).collect())
-}
-
-/// Gives the person of a seed another shape, its lowest marker as high as before.
-fn reshape(seed: &mut SeedMotion, betas: [f32; BETAS], world: &World) {
-    let lowest = |seed: &SeedMotion| {
-        let (shaped, mut markers) = (world.sim.body().shape(&seed.betas), [0.0; MARKER_DIM]);
-        shaped.markers(&shaped.pose(&seed.params[..PARAMS]), &mut markers);
-        markers.chunks_exact(3).map(|m| Vec3::from_slice(m).z).fold(f32::INFINITY, f32::min)
-    };
-    let before = lowest(seed);
-    seed.betas = betas;
-    let sunk = before - lowest(seed);
-    seed.params.chunks_exact_mut(PARAMS).for_each(|p| p[TRANSL][2] += sunk);
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -281,22 +260,5 @@ mod tests {
         let m = &places[0].movers[0];
         assert!((0.3..=0.8).contains(&m.speed) && m.shape.centre == Vec2::new(0.0, -1.5) && m.to == Vec2::new(0.0, 1.5));
         assert!(places[0].movers[0].phase != places[1].movers[0].phase);
-    }
-
-    #[test]
-    fn builds_differ_and_stand_on_the_floor() {
-        let world = World::embedded().unwrap();
-        let looks = Looks { turn_deg: 0.0, builds: true, shape: 0.3 };
-        let rng = &mut stream(1, "looks", 0);
-        let scenes: Vec<_> = (0..8).map(|_| first_poses(&looks, 2, &world, rng).unwrap()).collect();
-        let tall = |s: &[(SeedMotion, f32)]| s.iter().map(|p| p.0.betas[0] > 0.0).collect::<Vec<_>>();
-        assert!(scenes.iter().any(|s| tall(s)[0]) && scenes.iter().any(|s| !tall(s)[0]));
-        assert!(scenes.iter().filter(|s| tall(s)[0] == tall(s)[1]).count() >= 7, "of one build");
-        for (seed, _) in scenes.iter().flatten() {
-            let (shaped, mut markers) = (world.sim.body().shape(&seed.betas), [0.0; MARKER_DIM]);
-            shaped.markers(&shaped.pose(&seed.params[..PARAMS]), &mut markers);
-            let low = markers.iter().skip(2).step_by(3).fold(f32::INFINITY, |a, &b| a.min(b));
-            assert!((-0.02..0.06).contains(&low), "{low}");
-        }
     }
 }

@@ -154,13 +154,16 @@ fn actors(args: &Args, setups: &[Setup]) -> Result<Vec<(String, Actor)>> {
         let greedy = Greedy::default();
         actors.push((format!("greedy, best of {}", greedy.candidates), Actor::Greedy(greedy)));
     }
-    for dir in &args.policies {
-        let bundle = Bundle::read(dir).given()?;
-        let name = if bundle.trained.recipe.is_empty() { dir.display().to_string() } else { bundle.trained.recipe.clone() };
+    let bundles: Vec<Bundle> = args.policies.iter().map(|dir| Bundle::read(dir).given()).collect::<Result<_>>()?;
+    for (dir, bundle) in args.policies.iter().zip(&bundles) {
+        // By its recipe where that tells which one it is, else by its folder.
+        let recipe = &bundle.trained.recipe;
+        let unique = bundles.iter().filter(|b| b.trained.recipe == *recipe).count() == 1;
+        let name = if unique && !recipe.is_empty() { recipe.clone() } else { dir.display().to_string() };
         let ways = [(true, false, "stochastic"), (false, false, "deterministic"), (false, true, "deterministic, no egosensing")];
         for (noise, blind, how) in ways.into_iter().filter(|way| args.blind || !way.1) {
             let refused = |e| Error::config(format!("policy {}: {e}", dir.display()));
-            let mut actor = Actor::policy(&bundle, &setups[0].env, noise).map_err(refused)?;
+            let mut actor = Actor::policy(bundle, &setups[0].env, noise).map_err(refused)?;
             if blind {
                 actor = actor.blind();
             }

@@ -69,6 +69,23 @@ fn a_grid_is_trained_once_and_tabulated() {
 }
 
 #[test]
+fn variants_go_by_their_names() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let variants = "[[variants]]\nname = 'as it is'\n[[variants]]\nname = 'short, bold'\nset = { ppo.clip = 0.4, ppo.gamma = 0.5 }";
+    let output = sweep(&files(dir.path(), variants), &out, &["--jobs", "2"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert!(text.starts_with("setting,rung,epochs,variant,test_det/return,half95,done,tasks\n"), "{text}");
+    assert!(text.contains("1,1,2,as it is,") && text.contains("2,1,2,\"short, bold\","), "{text}");
+    let recipe = fs::read_to_string(out.join("settings/002/seed-1/recipe.toml")).unwrap();
+    assert!(recipe.contains("clip = 0.4") && recipe.contains("gamma = 0.5"), "{recipe}");
+    let page = fs::read_to_string(out.join("sweep.html")).unwrap();
+    let told = ["<td class=\"text\">short, bold</td>", "ppo.clip = 0.4, ppo.gamma = 0.5", "002 short, bold"];
+    assert!(told.iter().all(|w| page.contains(w)), "{page}");
+}
+
+#[test]
 fn tasks_are_done_by_number_and_go_on_after_a_kill() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("out");

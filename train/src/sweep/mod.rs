@@ -4,7 +4,7 @@ mod plan;
 mod results;
 mod task;
 
-pub use plan::{Changes, Draw, Halving, Random, Sweep, Task, survivors};
+pub use plan::{Changes, Draw, Halving, Random, Sweep, Task, Variant, survivors};
 pub use results::{Setting, ranked};
 pub use task::{Done, Manifest, State};
 

@@ -23,10 +23,13 @@ pub struct Sweep {
     pub seeds: Vec<u64>,
     /// The column of metrics.csv that ranks settings by its last value; larger is better.
     pub figure: String,
-    /// Keys of the recipe with values; all combinations are trained.
+    /// Named settings of several keys; none: the recipe alone.
+    #[serde(default)]
+    pub variants: Vec<Variant>,
+    /// Keys of the recipe with values; all combinations are trained, with each variant.
     #[serde(default)]
     pub grid: BTreeMap<String, Vec<toml::Value>>,
-    /// Keys whose values are drawn, anew for every combination of the grid.
+    /// Keys whose values are drawn, anew for every combination of variants and grid.
     #[serde(default)]
     pub random: Option<Random>,
     /// Ends early what does badly early.
@@ -34,11 +37,22 @@ pub struct Sweep {
     pub halving: Option<Halving>,
 }
 
+/// Values of several keys under one name.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Variant {
+    /// What tables and pages call it.
+    pub name: String,
+    /// Keys with values, as `"ppo.clip" = 0.1`, `ppo.clip = 0.1` or `ppo = { clip = 0.1 }`; none: the recipe as it is.
+    #[serde(default)]
+    pub set: toml::Table,
+}
+
 /// Random search.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Random {
-    /// Draws per combination of the grid.
+    /// Draws per combination of variants and grid.
     pub count: usize,
     #[serde(default)]
     pub seed: u64,
@@ -80,7 +94,10 @@ pub struct Task {
     pub id: String,
     /// Number of the setting, from 1.
     pub setting: usize,
-    /// What makes the setting.
+    /// The name of its variant; empty where the sweep has none.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub variant: String,
+    /// What makes the setting, the variant's keys included.
     pub changes: Changes,
     pub seed: u64,
     /// Where it trains, from the manifest's folder.
@@ -88,6 +105,24 @@ pub struct Task {
     /// The resolved recipe as TOML, and its content hash.
     pub recipe: String,
     pub hash: String,
+}
+
+impl Variant {
+    /// Every key with its value. A table under a plain key is gone into; one under a key with dots, which had to be quoted, is the value.
+    pub fn changes(&self) -> Changes {
+        fn walk(prefix: &str, table: &toml::Table, out: &mut Changes) {
+            for (key, value) in table {
+                let path = format!("{prefix}{key}");
+                match value {
+                    toml::Value::Table(inner) if !key.contains('.') => walk(&format!("{path}."), inner, out),
+                    value => _ = out.insert(path, value.clone()),
+                }
+            }
+        }
+        let mut changes = Changes::new();
+        walk("", &self.set, &mut changes);
+        changes
+    }
 }
 
 impl Sweep {
@@ -105,6 +140,7 @@ impl Sweep {
         need(!self.seeds.is_empty(), "seeds is empty, expected at least one".into())?;
         let twice = self.seeds.iter().enumerate().find(|(i, seed)| self.seeds[..*i].contains(seed));
         need(twice.is_none(), format!("seeds has {} twice", twice.map_or(0, |(_, s)| *s)))?;
+        self.check_variants()?;
         for (key, values) in &self.grid {
             need(!values.is_empty(), format!("grid.{key} is empty, expected at least one value"))?;
         }
@@ -124,31 +160,56 @@ impl Sweep {
             let rising = !epochs.is_empty() && epochs[0] > 0 && epochs.is_sorted_by(|a, b| a < b);
             need(rising, format!("halving.epochs is {epochs:?}, expected numbers from 1 up, each more than the one before"))?;
             need(*keep > 0.0 && *keep < 1.0, format!("halving.keep is {keep}, expected between 0 and 1"))?;
-            let epochs = self.grid.contains_key("run.epochs") || self.random.as_ref().is_some_and(|r| r.keys.contains_key("run.epochs"));
-            need(!epochs, "run.epochs cannot be swept beside halving, which sets it".into())?;
+            let varied = self.variants.iter().any(|v| v.changes().contains_key("run.epochs"));
+            need(!varied && !self.keys().contains(&"run.epochs"), "run.epochs cannot be swept beside halving, which sets it".into())?;
         }
         Ok(())
     }
 
-    /// Every setting, in a fixed order.
-    pub fn settings(&self) -> Vec<Changes> {
-        let mut all = vec![Changes::new()];
+    fn check_variants(&self) -> Result<()> {
+        let keys = self.keys();
+        for (i, variant) in self.variants.iter().enumerate() {
+            let bad = |what: String| Err(Error::config(format!("variants: '{}' {what}", variant.name)));
+            if variant.name.trim().is_empty() || self.variants[..i].iter().any(|other| other.name == variant.name) {
+                return bad(format!("is the name of variant {}, expected one that no other has", i + 1));
+            }
+            if let Some(key) = variant.changes().keys().find(|key| keys.contains(&key.as_str())) {
+                return bad(format!("sets {key}, which grid or random sets, too"));
+            }
+        }
+        Ok(())
+    }
+
+    /// Keys that are swept one by one: those of grid and random.
+    pub fn keys(&self) -> Vec<&str> {
+        let random = self.random.iter().flat_map(|r| r.keys.keys());
+        let mut keys: Vec<&str> = self.grid.keys().chain(random).map(String::as_str).collect();
+        keys.sort_unstable();
+        keys
+    }
+
+    /// Every setting in a fixed order: the name of its variant, and what makes it.
+    pub fn settings(&self) -> Vec<(String, Changes)> {
+        let mut all: Vec<_> = self.variants.iter().map(|v| (v.name.clone(), v.changes())).collect();
+        if all.is_empty() {
+            all.push((String::new(), Changes::new()));
+        }
         for (key, values) in &self.grid {
-            let with = |base: &Changes, value: &toml::Value| {
+            let with = |(name, base): &(String, Changes), value: &toml::Value| {
                 let mut changes = base.clone();
                 changes.insert(key.clone(), value.clone());
-                changes
+                (name.clone(), changes)
             };
             all = all.iter().flat_map(|base| values.iter().map(move |v| with(base, v)).collect::<Vec<_>>()).collect();
         }
         let Some(random) = &self.random else { return all };
         let count = random.count as u64;
-        let drawn = |(k, base): (u64, Changes)| {
+        let drawn = |(k, (name, base)): (u64, (String, Changes))| {
             (0..count).map(move |i| {
                 let mut rng = stream(random.seed, "sweep", k * count + i);
                 let mut changes = base.clone();
                 changes.extend(random.keys.iter().map(|(key, draw)| (key.clone(), draw.value(&mut rng))));
-                changes
+                (name.clone(), changes)
             })
         };
         (0..).zip(all).flat_map(drawn).collect()
@@ -159,21 +220,23 @@ impl Sweep {
         let all = self.settings();
         let mut tasks = Vec::new();
         for &setting in settings {
-            let changes = all.get(setting - 1).ok_or_else(|| Error::run(format!("the sweep has no setting {setting}")))?;
+            let (variant, changes) = all.get(setting - 1).ok_or_else(|| Error::run(format!("the sweep has no setting {setting}")))?;
             let mut sets: Vec<String> = changes.iter().map(|(key, value)| format!("{key}={value}")).collect();
             if let Some(halving) = &self.halving {
                 let epochs = halving.epochs.get(rung).ok_or_else(|| Error::run(format!("the sweep has no rung {rung}")))?;
                 sets.push(format!("run.epochs={epochs}"));
             }
-            let base = Recipe::load(&self.recipe, &sets)?;
+            let named = |e: Error| if variant.is_empty() { e } else { Error::config(format!("variant '{variant}': {e}")) };
+            let base = Recipe::load(&self.recipe, &sets).map_err(named)?;
             if self.halving.is_some() && !base.stages.is_empty() {
                 return Err(Error::config("halving: expected a recipe without stages".to_string()));
             }
             for &seed in &self.seeds {
-                let recipe = Scheme::new(Recipe { seed, ..base.clone() })?.recipe.to_toml()?;
+                let recipe = Scheme::new(Recipe { seed, ..base.clone() }).map_err(named)?.recipe.to_toml()?;
                 let folder = format!("settings/{setting:03}/seed-{seed}");
                 let (id, hash) = (format!("{setting:03}-seed-{seed}"), content_hash(recipe.as_bytes()));
-                tasks.push(Task { id, setting, changes: changes.clone(), seed, folder, recipe, hash });
+                let (variant, changes) = (variant.clone(), changes.clone());
+                tasks.push(Task { id, setting, variant, changes, seed, folder, recipe, hash });
             }
         }
         Ok(tasks)
@@ -215,7 +278,7 @@ mod tests {
     #[test]
     fn grids_are_all_combinations() {
         let sweep = sweep("[grid]\n'ppo.clip' = [0.1, 0.2]\n'adam.schedule' = ['linear', 'constant', 'linear']").unwrap();
-        let all = sweep.settings();
+        let all: Vec<Changes> = sweep.settings().into_iter().map(|(_, changes)| changes).collect();
         let pair = |c: &Changes| (c["adam.schedule"].as_str().unwrap().to_string(), c["ppo.clip"].as_float().unwrap());
         assert_eq!(
             (all.len(), pair(&all[0]), pair(&all[1]), pair(&all[2])),
@@ -236,14 +299,37 @@ mod tests {
         let text = "[grid]\n'ppo.batch' = [256, 512]\n[random]\ncount = 200\nseed = 3\n[random.keys]\n'adam.lr' = { log = [1e-4, 1e-2] }
             'ppo.clip' = { uniform = [0.1, 0.3] }\n'ppo.passes' = { choice = [1, 2] }";
         let sweep = sweep(text).unwrap();
-        let all = sweep.settings();
-        assert!(all.len() == 400 && all == sweep.settings());
+        assert_eq!(sweep.settings(), sweep.settings());
+        let all: Vec<Changes> = sweep.settings().into_iter().map(|(_, changes)| changes).collect();
+        assert_eq!(all.len(), 400);
         let below = |key: &str, x: f64| all.iter().filter(|c| c[key].as_float().unwrap() < x).count() as f64 / 400.0;
         assert_eq!((below("adam.lr", 1e-4), below("adam.lr", 1e-2), below("ppo.clip", 0.1), below("ppo.clip", 0.3)), (0.0, 1.0, 0.0, 1.0));
         // Half lies below the middle, geometric or not: within four standard deviations, 0.025 each.
         assert!((below("adam.lr", 1e-3) - 0.5).abs() < 0.1 && (below("ppo.clip", 0.2) - 0.5).abs() < 0.1);
         assert!(all.iter().all(|c| [1, 2].contains(&c["ppo.passes"].as_integer().unwrap())));
         assert_ne!(all[0]["adam.lr"], all[200]["adam.lr"], "every combination has draws of its own");
+    }
+
+    #[test]
+    fn variants_are_crossed_with_the_grid() {
+        let variants = "[[variants]]
+            name = 'as it is'
+            [[variants]]
+            name = 'entropy, slow'
+            set = { ppo.entropy = 0.5, ppo.kl_prior = 0.0, 'adam.schedule' = { adaptive = { target_kl = 0.02 } } }";
+        let sweep = sweep(&format!("{variants}\n[grid]\n'ppo.clip' = [0.1, 0.2]")).unwrap();
+        let tasks = sweep.tasks(0, &[1, 2, 3, 4]).unwrap();
+        let names: Vec<&str> = tasks.iter().step_by(2).map(|t| t.variant.as_str()).collect();
+        assert_eq!(names, ["as it is", "as it is", "entropy, slow", "entropy, slow"]);
+        let recipe = |task: &Task| Recipe::parse("task", &task.recipe, &[]).unwrap();
+        let (plain, other) = (recipe(&tasks[2]), recipe(&tasks[7]));
+        assert_eq!((plain.ppo.clip, other.ppo.clip, other.seed), (0.2, 0.2, 4));
+        assert_eq!((other.ppo.entropy, other.ppo.kl_prior), (0.5, 0.0));
+        assert!(plain.ppo.entropy != 0.5 && matches!(other.adam.schedule, crate::Schedule::Adaptive { target_kl: 0.02, .. }));
+        // Quoted keys, tables and dotted keys come to the same.
+        let set = |text: &str| Variant { name: String::new(), set: toml::from_str(text).unwrap() }.changes();
+        assert_eq!(set("'a.b' = 1\n'a.c' = 2"), set("a = { b = 1, c = 2 }"));
+        assert_eq!(set("a.b = 1").keys().collect::<Vec<_>>(), ["a.b"]);
     }
 
     #[test]
@@ -267,6 +353,10 @@ mod tests {
             ("[random]\ncount = 1\nkeys = { a = { log = [0.0, 1.0] } }", "random.keys.a"),
             ("[halving]\nepochs = [4, 4]", "halving.epochs"),
             ("[halving]\nepochs = [4]\nkeep = 1.0", "halving.keep"),
+            ("[halving]\nepochs = [4]\n[[variants]]\nname = 'a'\nset = { run.epochs = 1 }", "run.epochs"),
+            ("[[variants]]\nname = 'a'\n[[variants]]\nname = 'a'", "'a' is the name of variant 2"),
+            ("[[variants]]\nname = ' '", "variant 1"),
+            ("[[variants]]\nname = 'a'\nset = { ppo.clip = 0.1 }\n[grid]\n'ppo.clip' = [0.2]", "'a' sets ppo.clip"),
             ("[halving]\nepochs = [4]\n[grid]\n'run.epochs' = [1]", "run.epochs"),
         ] {
             let e = sweep(text).unwrap_err().to_string();
@@ -274,5 +364,7 @@ mod tests {
         }
         let e = sweep("[grid]\n'ppo.clipp' = [0.1]").unwrap().tasks(0, &[1]).unwrap_err().to_string();
         assert!(e.contains("clipp"), "{e}");
+        let e = sweep("[[variants]]\nname = 'odd'\nset.ppo.clip = 1.5").unwrap().tasks(0, &[1]).unwrap_err().to_string();
+        assert!(e.contains("variant 'odd'") && e.contains("ppo.clip is 1.5"), "{e}");
     }
 }

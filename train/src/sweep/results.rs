@@ -1,20 +1,24 @@
 //! What a sweep came to: a table, and a page.
 
-use super::plan::Changes;
+use super::plan::{Changes, Variant};
 use super::{Folder, Manifest, State};
 use crate::Result;
 use crate::html::{Cell, Page, Picture};
-use crate::plot::{Marks, Titles, marked_lines};
+use crate::plot::{Marks, Series, Titles, marked_lines};
 use crate::report::{Group, curve_of};
 use egogen::io::write_atomic;
 
 /// Settings whose curves the page shows.
 const CURVES: usize = 4;
+/// The column of the names of variants.
+const VARIANT: &str = "variant";
 
 /// One setting, with what its tasks came to.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Setting {
     pub number: usize,
+    /// The name of its variant; empty where the sweep has none.
+    pub variant: String,
     pub changes: Changes,
     /// Rungs it got to, from 1, and the epochs of its last done task.
     pub rung: usize,
@@ -31,8 +35,8 @@ pub fn ranked(manifest: &Manifest, figure: &str) -> Vec<Setting> {
     let mut values: Vec<Vec<f64>> = Vec::new();
     for task in &manifest.tasks {
         if settings.last().is_none_or(|s| s.number != task.setting) {
-            let (number, changes) = (task.setting, task.changes.clone());
-            settings.push(Setting { number, changes, rung: 1, epochs: 0, mean: None, done: 0, tasks: 0 });
+            let (number, variant, changes) = (task.setting, task.variant.clone(), task.changes.clone());
+            settings.push(Setting { number, variant, changes, rung: 1, epochs: 0, mean: None, done: 0, tasks: 0 });
             values.push(vec![]);
         }
         let (Some(setting), Some(values)) = (settings.last_mut(), values.last_mut()) else { continue };
@@ -51,7 +55,20 @@ pub fn ranked(manifest: &Manifest, figure: &str) -> Vec<Setting> {
     settings
 }
 
+impl Setting {
+    /// What the setting has in a column of the table: the name of its variant, or the value of a key.
+    fn cell(&self, column: &str) -> String {
+        if column == VARIANT { self.variant.clone() } else { self.changes.get(column).map_or(String::new(), |v| v.to_string()) }
+    }
+}
+
 impl Folder<'_> {
+    /// Columns that tell settings apart.
+    fn columns(&self) -> Vec<&str> {
+        let names = if self.sweep.variants.is_empty() { None } else { Some(VARIANT) };
+        names.into_iter().chain(self.sweep.keys()).collect()
+    }
+
     /// Every setting where it got to: those of the last rung first, by the figure.
     pub fn settings(&self) -> Result<Vec<Setting>> {
         let mut all: Vec<Setting> = Vec::new();
@@ -66,14 +83,14 @@ impl Folder<'_> {
     /// Writes `table.csv` and `sweep.html`; gives the table.
     pub fn sum_up(&self) -> Result<String> {
         let settings = self.settings()?;
-        let keys: Vec<&String> = settings.first().map_or(vec![], |s| s.changes.keys().collect());
+        let keys = self.columns();
         let number = |v: Option<f64>| v.map_or(String::new(), |v| format!("{v:.4}"));
         let mut table = String::from("setting,rung,epochs");
         keys.iter().for_each(|key| table += &format!(",{key}"));
         table += &format!(",{},half95,done,tasks\n", self.sweep.figure);
         for s in &settings {
             table += &format!("{},{},{}", s.number, s.rung, s.epochs);
-            keys.iter().for_each(|key| table += &format!(",{}", quoted(&s.changes[*key].to_string())));
+            keys.iter().for_each(|key| table += &format!(",{}", quoted(&s.cell(key))));
             let [mean, half] = [0, 1].map(|k| number(s.mean.map(|m| m[k])));
             table += &format!(",{mean},{half},{},{}\n", s.done, s.tasks);
         }
@@ -82,7 +99,7 @@ impl Folder<'_> {
         Ok(table)
     }
 
-    fn page(&self, settings: &[Setting], keys: &[&String]) -> Result<String> {
+    fn page(&self, settings: &[Setting], keys: &[&str]) -> Result<String> {
         let figure = &self.sweep.figure;
         let mut page = Page::new("Sweep");
         page.text(&format!(
@@ -93,16 +110,22 @@ impl Folder<'_> {
             self.sweep.seeds.len()
         ));
         let heads: Vec<&str> =
-            ["setting"].into_iter().chain(keys.iter().map(|k| k.as_str())).chain([figure.as_str(), "epochs", "rung", "done"]).collect();
+            ["setting"].into_iter().chain(keys.iter().copied()).chain([figure.as_str(), "epochs", "rung", "done"]).collect();
         let row = |s: &Setting| {
             let mut row: Vec<Cell> = vec![format!("{:03}", s.number).into()];
-            row.extend(keys.iter().map(|key| Cell::from(s.changes[*key].to_string())));
+            row.extend(keys.iter().map(|key| Cell::words(s.cell(key))));
             row.push(s.mean.map_or("-".into(), |[mean, half]| Cell::from(format!("{mean:.4}")).note(format!("± {half:.4}"))));
             row.extend([Cell::from(s.epochs.to_string()), s.rung.to_string().into()]);
             row.push(Cell::verdict(format!("{} of {}", s.done, s.tasks), s.done == s.tasks));
             row
         };
         page.table(&heads, &settings.iter().map(row).collect::<Vec<_>>());
+        if !self.sweep.variants.is_empty() {
+            page.section("Variants");
+            let sets = |changes: Changes| changes.iter().map(|(key, value)| format!("{key} = {value}")).collect::<Vec<_>>().join(", ");
+            let row = |v: &Variant| vec![Cell::from(v.name.as_str()), Cell::words(sets(v.changes()))];
+            page.table(&["variant", "sets"], &self.sweep.variants.iter().map(row).collect::<Vec<_>>());
+        }
         self.curves(&mut page, settings)?;
         let manifests = self.manifests()?;
         let states = manifests.iter().flat_map(|m| m.tasks.iter().map(|t| (&t.id, m.state(t))));
@@ -121,8 +144,12 @@ impl Folder<'_> {
     fn curves(&self, page: &mut Page, settings: &[Setting]) -> Result<()> {
         let figure = &self.sweep.figure;
         let folder = |s: &Setting| self.dir.join(format!("settings/{:03}", s.number));
-        let groups = settings.iter().take(CURVES).filter(|s| s.done > 0).map(|s| Group::read(&folder(s))).collect::<Result<Vec<_>>>()?;
-        let series: Vec<_> = groups.iter().map(|g| curve_of(g, figure)).filter(|s| !s.points.is_empty()).collect();
+        let mut series = Vec::new();
+        for s in settings.iter().take(CURVES).filter(|s| s.done > 0) {
+            let curve = curve_of(&Group::read(&folder(s))?, figure);
+            series.push(Series { name: format!("{:03} {}", s.number, s.variant).trim_end().into(), ..curve });
+        }
+        series.retain(|s| !s.points.is_empty());
         let Some(&(_, first)) = series.first().and_then(|s| s.points.first()) else { return Ok(()) };
         page.section("The first settings over epochs");
         let plot = marked_lines(Titles { title: figure, x: "epoch", y: "" }, first..first, &series, &Marks::default())?;

@@ -6,7 +6,7 @@ use common::{assert_same_run, column, program, read, stderr, succeed, train};
 use egogen_train::sweep::{Manifest, State};
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 /// The point in epochs so short that most of the time goes into files.
@@ -98,11 +98,7 @@ fn tasks_are_done_by_number_and_go_on_after_a_kill() {
     let task = ["--task", text(&path), "--index", "2"];
     let run = out.join("settings/002/seed-0");
     let mut child = program(&task).stderr(Stdio::null()).spawn().unwrap();
-    let begun = Instant::now();
-    while !run.join("metrics.csv").exists() {
-        assert!(begun.elapsed() < Duration::from_secs(60));
-        std::thread::sleep(Duration::from_millis(2));
-    }
+    wait_for(|| run.join("metrics.csv").exists());
     child.kill().unwrap();
     assert_eq!(child.wait().unwrap().code(), None, "killed before its end");
     assert_eq!(manifest.state(&manifest.tasks[2]), State::Open);
@@ -126,16 +122,108 @@ fn tasks_are_done_by_number_and_go_on_after_a_kill() {
 fn what_fails_is_told_and_the_rest_goes_on() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("out");
-    let file = files(dir.path(), "[grid]\n'checkpoint.best' = ['test_det/return', 'test_det/glory']");
+    let file = files(dir.path(), "[grid]\n'ppo.clip' = [0.2, 0.1]");
+    sweep(&file, &out, &["--plan"]);
+    // What stands in the way of two tasks.
+    for seed in [0, 1] {
+        let run = out.join(format!("settings/002/seed-{seed}"));
+        fs::create_dir_all(&run).unwrap();
+        fs::copy(dir.path().join("small.toml"), run.join("recipe.toml")).unwrap();
+    }
     for _ in 0..2 {
         let output = sweep(&file, &out, &[]);
         let told = stderr(&output);
-        assert!(output.status.code() == Some(1) && told.contains("2 tasks failed") && told.contains("test_det/glory"), "{told}");
+        assert!(output.status.code() == Some(1) && told.contains("2 tasks failed") && told.contains("is of another task"), "{told}");
         let rows = table(&output);
         assert_eq!((rows[1][0].as_str(), rows[1][6].as_str(), rows[2][0].as_str(), rows[2][6].as_str()), ("1", "2", "2", "0"), "{rows:?}");
     }
     let page = fs::read_to_string(out.join("sweep.html")).unwrap();
     assert!(page.contains("Failed tasks") && page.contains("002-seed-1"));
+}
+
+#[test]
+fn what_no_task_could_do_is_refused_before_any_begins() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let output = sweep(&files(dir.path(), "[grid]\n'checkpoint.best' = ['test_det/return', 'test_det/glory']"), &out, &[]);
+    let told = stderr(&output);
+    assert!(output.status.code() == Some(2) && told.contains("setting 2") && told.contains("test_det/glory"), "{told}");
+    assert!(!out.exists());
+}
+
+/// A sweep with more epochs than can be trained here, two tasks of which are under way.
+fn endless(dir: &Path, out: &Path) -> Child {
+    let file = files(dir, "[grid]\n'run.epochs' = [1000000, 1000001]");
+    let child = program(&["sweep", text(&file), "--out", text(out), "--jobs", "2"]).stderr(Stdio::null()).stdout(Stdio::null()).spawn();
+    (0..2).for_each(|seed| wait_for(|| out.join(format!("settings/001/seed-{seed}/metrics.csv")).exists()));
+    child.unwrap()
+}
+
+fn wait_for(what: impl Fn() -> bool) {
+    let begun = Instant::now();
+    while !what() {
+        assert!(begun.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// Whether the task has saved and stopped: its last epoch has a checkpoint.
+fn has_saved(out: &Path, id: &str) -> bool {
+    let (setting, seed) = id.split_once('-').unwrap();
+    let run = out.join("settings").join(setting).join(seed);
+    fs::read_to_string(out.join(format!("logs/{id}.txt"))).unwrap().contains("interrupted and saved")
+        && run.join(format!("checkpoints/epoch-{:04}/checkpoint.json", column(&run, "env_steps").len())).exists()
+}
+
+#[cfg(unix)]
+#[test]
+fn what_stops_the_pool_makes_its_tasks_save() {
+    for (signal, code) in [("-TERM", Some(130)), ("-INT", Some(130)), ("-KILL", None)] {
+        let dir = tempfile::tempdir().unwrap();
+        let out = dir.path().join("out");
+        let mut pool = endless(dir.path(), &out);
+        assert!(Command::new("kill").args([signal, &pool.id().to_string()]).status().unwrap().success());
+        assert_eq!(pool.wait().unwrap().code(), code);
+        if code.is_none() {
+            // Nobody waits for the tasks of a pool that was killed.
+            wait_for(|| ["001-seed-0", "001-seed-1"].iter().all(|id| has_saved(&out, id)));
+        }
+        assert!(["001-seed-0", "001-seed-1"].iter().all(|id| has_saved(&out, id)), "{signal}");
+        assert!(!out.join("settings/002").exists(), "{signal}: another task was begun");
+    }
+}
+
+#[test]
+fn a_task_that_cannot_start_makes_the_others_save() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    // A folder where the log of the second task would be.
+    fs::create_dir_all(out.join("logs/001-seed-1.txt")).unwrap();
+    let output = sweep(&files(dir.path(), "[grid]\n'run.epochs' = [1000000]"), &out, &["--jobs", "2"]);
+    assert!(output.status.code() == Some(1) && stderr(&output).contains("001-seed-1.txt"), "{}", stderr(&output));
+    assert!(fs::read_to_string(out.join("logs/001-seed-0.txt")).unwrap().contains("interrupted and saved"));
+}
+
+#[test]
+fn halving_lengthens_the_last_stage() {
+    let dir = tempfile::tempdir().unwrap();
+    let out = dir.path().join("out");
+    let file = files(dir.path(), "[grid]\n'stages.turn.ppo.clip' = [0.1, 0.3]\n[halving]\nepochs = [2, 4]");
+    let recipe = dir.path().join("small.toml");
+    let stages = "[[stages]]\nname = 'walk'\nrun = { epochs = 3 }\n[[stages]]\nname = 'turn'\nrun = { epochs = 9 }\n";
+    fs::write(&recipe, fs::read_to_string(&recipe).unwrap() + stages).unwrap();
+    let output = sweep(&file, &out, &["--jobs", "2"]);
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    let rows = table(&output);
+    let shape: Vec<[&str; 2]> = rows[1..].iter().map(|r| [r[1].as_str(), r[2].as_str()]).collect();
+    assert_eq!(shape, [["2", "7"], ["1", "5"]], "rung and epochs of all stages: {rows:?}");
+    let run = out.join(format!("settings/{:0>3}/seed-1", rows[1][0]));
+    let epochs = ["1-walk", "2-turn"].map(|stage| column(&run.join("stages").join(stage), "env_steps").len());
+    assert_eq!(epochs, [3, 4]);
+    // The same as a run that was never halved.
+    let (clip, alone) = (format!("stages.turn.ppo.clip={}", rows[1][3]), dir.path().join("alone"));
+    succeed(&[text(&recipe), "--seed", "1", "--set", &clip, "--set", "stages.turn.run.epochs=4", "--out", text(&alone)]);
+    assert_same_run(&alone.join("stages/2-turn"), &run.join("stages/2-turn"), "epoch-0004");
 }
 
 #[test]
@@ -156,6 +244,19 @@ fn halving_trains_the_better_settings_longer() {
     assert_eq!(again.stdout, output.stdout);
 }
 
+#[cfg(unix)]
+fn scripts() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/examples/sweep")
+}
+
+/// `PATH` with this `train` before everything else.
+#[cfg(unix)]
+fn path_with_train(bin: &Path) -> String {
+    fs::create_dir(bin).unwrap();
+    std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_train"), bin.join("train")).unwrap();
+    format!("{}:{}", bin.display(), std::env::var("PATH").unwrap())
+}
+
 /// The scripts for engines, with programs in their place that write down what they are asked and run one task.
 #[cfg(unix)]
 #[test]
@@ -165,20 +266,17 @@ fn engines_get_every_task() {
     let out = dir.path().join("out");
     sweep(&files(dir.path(), ""), &out, &["--plan"]);
     let bin = dir.path().join("bin");
-    fs::create_dir(&bin).unwrap();
+    let path = path_with_train(&bin);
     let place = |name: &str, script: &str| {
         fs::write(bin.join(name), format!("#!/bin/sh\n{script}\n")).unwrap();
         fs::set_permissions(bin.join(name), fs::Permissions::from_mode(0o755)).unwrap();
     };
-    std::os::unix::fs::symlink(env!("CARGO_BIN_EXE_train"), bin.join("train")).unwrap();
     // The last two arguments are script and manifest; the last five a shell's command, its words and the manifest.
     place("sbatch", "echo \"$@\" > sbatch.txt; while [ $# -gt 2 ]; do shift; done; SLURM_ARRAY_TASK_ID=1 exec sh \"$@\"");
     place("hq", "echo \"$@\" > hq.txt; while [ \"$1\" != -- ]; do shift; done; shift; HQ_TASK_ID=0 exec \"$@\"");
-    let scripts = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/examples/sweep");
-    let path = format!("{}:{}", bin.display(), std::env::var("PATH").unwrap());
     for (script, told, option) in [("slurm.sh", "sbatch.txt", "--partition=long"), ("hyperqueue.sh", "hq.txt", "--crash-limit=5")] {
-        let mut command = std::process::Command::new("sh");
-        let command = command.arg(scripts.join(script)).arg("out/manifest.jsonl").arg(option).env("PATH", &path).current_dir(&dir);
+        let mut command = Command::new("sh");
+        let command = command.arg(scripts().join(script)).arg("out/manifest.jsonl").arg(option).env("PATH", &path).current_dir(&dir);
         let output = command.output().unwrap();
         assert!(output.status.success(), "{script}: {}", stderr(&output));
         let asked = fs::read_to_string(dir.path().join(told)).unwrap();

@@ -83,6 +83,9 @@ struct Args {
     /// Which task, from 0
     #[arg(long, value_name = "N", requires = "task")]
     index: Option<usize>,
+    /// Save and stop, as on Ctrl-C, when standard input ends: with whoever holds its other end
+    #[arg(long, requires = "task")]
+    until_eof: bool,
     /// Threads to use; results do not depend on it [default: all cores]
     #[arg(long)]
     threads: Option<usize>,
@@ -155,7 +158,7 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
             start_threads(*threads)?;
             return choose(dir, set, registry);
         }
-        Some(Command::Sweep { file, out, jobs, threads, plan }) => return sweep(file, out, [jobs.get(), threads.get()], *plan),
+        Some(Command::Sweep { file, out, jobs, threads, plan }) => return sweep(file, out, [jobs.get(), threads.get()], *plan, registry),
         Some(Command::Report { runs, films, out, threads }) => {
             start_threads(*threads)?;
             return report(runs, *films, out.as_deref(), registry);
@@ -164,6 +167,9 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
     }
     if let (Some(path), Some(index)) = (&args.task, args.index) {
         let (manifest, threads, stop) = (Manifest::read(path)?, start_threads(args.threads)?, watch()?);
+        if args.until_eof {
+            watch_input(stop.clone());
+        }
         return Ok(code(manifest.run(index, registry, threads, &stop)?));
     }
     if args.list {
@@ -203,8 +209,11 @@ fn act(args: &Args, registry: &Registry) -> Result<u8> {
 }
 
 /// Does what is left of the sweep in `file`, or only plans and sums it up.
-fn sweep(file: &Path, dir: &Path, [jobs, threads]: [usize; 2], plan: bool) -> Result<u8> {
+fn sweep(file: &Path, dir: &Path, [jobs, threads]: [usize; 2], plan: bool, registry: &Registry) -> Result<u8> {
     let sweep = Sweep::read(file)?;
+    if !dir.join("manifest.jsonl").exists() {
+        sweep.check_tasks(registry)?;
+    }
     let folder = Folder { sweep: &sweep, dir };
     let stop = watch()?;
     let standing = if plan { None } else { Some(folder.run(jobs, threads, &stop)?) };
@@ -262,15 +271,25 @@ fn choose(dir: &Path, set: &[String], registry: &Registry) -> Result<u8> {
 /// What Ctrl-C sets.
 fn watch() -> Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
-    let flag = stop.clone();
+    let (flag, mut asked) = (stop.clone(), false);
     ctrlc::set_handler(move || {
         // The second time, at once.
-        if flag.swap(true, Ordering::SeqCst) {
+        if std::mem::replace(&mut asked, true) {
             std::process::exit(i32::from(INTERRUPTED));
         }
+        flag.store(true, Ordering::SeqCst);
     })
     .map_err(|e| Error::run(format!("cannot watch for Ctrl-C: {e}")))?;
     Ok(stop)
+}
+
+/// Sets `stop` when standard input ends.
+fn watch_input(stop: Arc<AtomicBool>) {
+    std::thread::spawn(move || {
+        // An input that cannot be read has ended.
+        let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+        stop.store(true, Ordering::SeqCst);
+    });
 }
 
 fn code(outcome: Outcome) -> u8 {

@@ -69,6 +69,25 @@ pub(crate) fn stage_folder(i: usize, name: &str) -> String {
     format!("stages/{}-{name}", i + 1)
 }
 
+/// Refuses, before anything is trained, what a later stage would stop at.
+pub(crate) fn check_stages(scheme: &Scheme, registry: &Registry) -> Result<()> {
+    let mut before: Option<(&str, PolicySpec)> = None;
+    for part in &scheme.parts {
+        let named = |e: &dyn std::fmt::Display| match part.name.as_str() {
+            "" => Error::config(e.to_string()),
+            name => Error::config(format!("stage '{name}': {e}")),
+        };
+        let spec = Trainer::check(&part.plan, registry).map_err(|e| named(&e))?;
+        if let Some((name, other)) = before.filter(|_| part.from != From::Nothing)
+            && (&other.layout, other.action) != (&spec.layout, spec.action)
+        {
+            return Err(named(&format!("observations or actions differ from those of stage '{name}', whose weights it begins with")));
+        }
+        before = Some((&part.name, spec));
+    }
+    Ok(())
+}
+
 impl Job<'_> {
     /// Trains what is left to do; `resume`: the folder holds a run that was begun. `check` hears what the first stage stands on.
     pub fn run(&self, resume: bool, stop: &AtomicBool, check: &dyn Fn(&Origin) -> Result<()>) -> Result<Outcome> {
@@ -78,7 +97,7 @@ impl Job<'_> {
             return trainer.run(stop);
         }
         if !resume {
-            self.check_stages()?;
+            check_stages(self.scheme, self.registry)?;
         }
         write_atomic(self.dir.join("recipe.toml"), self.scheme.recipe.to_toml()?.as_bytes())?;
         [self.dir.to_path_buf(), self.dir.join("policy")].iter().try_for_each(|dir| checkpoint::sweep(dir))?;
@@ -101,22 +120,6 @@ impl Job<'_> {
         }
         self.sum_up()?;
         Ok(Outcome::Finished)
-    }
-
-    /// Refuses, before anything is trained, what a later stage would stop at.
-    fn check_stages(&self) -> Result<()> {
-        let mut before: Option<(&str, PolicySpec)> = None;
-        for part in &self.scheme.parts {
-            let named = |e: &dyn std::fmt::Display| Error::config(format!("stage '{}': {e}", part.name));
-            let spec = Trainer::check(&part.plan, self.registry).map_err(|e| named(&e))?;
-            if let Some((name, other)) = before.filter(|_| part.from != From::Nothing)
-                && (&other.layout, other.action) != (&spec.layout, spec.action)
-            {
-                return Err(named(&format!("observations or actions differ from those of stage '{name}', whose weights it begins with")));
-            }
-            before = Some((&part.name, spec));
-        }
-        Ok(())
     }
 
     fn folder(&self, i: usize) -> PathBuf {

@@ -82,15 +82,24 @@ impl Folder<'_> {
         Ok(Standing::Finished { failed })
     }
 
-    /// Does the tasks of one manifest.
+    /// Does the tasks of one manifest. Once `stop` is set, or a task cannot be started, those under way save and stop.
     fn pool(&self, manifest: &Manifest, jobs: usize, threads: usize, stop: &AtomicBool) -> Result<Standing> {
         let left = |i: &usize| !matches!(manifest.state(&manifest.tasks[*i]), State::Done(_));
         let mut open: Vec<usize> = (0..manifest.tasks.len()).filter(left).rev().collect();
         let mut running: Vec<(usize, Child)> = Vec::new();
-        while !running.is_empty() || !open.is_empty() && !stop.load(Ordering::SeqCst) {
-            while running.len() < jobs && !stop.load(Ordering::SeqCst) {
+        let mut error = None;
+        let ending = |error: &Option<Error>| error.is_some() || stop.load(Ordering::SeqCst);
+        while !running.is_empty() || !open.is_empty() && !ending(&error) {
+            while running.len() < jobs && !ending(&error) {
                 let Some(index) = open.pop() else { break };
-                running.push((index, self.spawn(manifest, index, threads)?));
+                match self.spawn(manifest, index, threads) {
+                    Ok(child) => running.push((index, child)),
+                    Err(e) => error = Some(e),
+                }
+            }
+            if ending(&error) {
+                // Closes their input.
+                running.iter_mut().for_each(|(_, child)| drop(child.stdin.take()));
             }
             std::thread::sleep(LOOK);
             let mut still = Vec::new();
@@ -109,6 +118,7 @@ impl Folder<'_> {
             }
             running = still;
         }
+        error.map_or(Ok(()), Err)?;
         Ok(if stop.load(Ordering::SeqCst) { Standing::Interrupted } else { Standing::Finished { failed: 0 } })
     }
 
@@ -116,7 +126,7 @@ impl Folder<'_> {
         self.dir.join("logs").join(format!("{id}.txt"))
     }
 
-    /// This program again, for one task.
+    /// This program again, for one task. It watches its input, which ends when this process closes it or is gone in whatever way.
     fn spawn(&self, manifest: &Manifest, index: usize, threads: usize) -> Result<Child> {
         let log = self.log(&manifest.tasks[index].id);
         let io = |e| Error::Core(egogen::Error::io(&log, e));
@@ -124,8 +134,8 @@ impl Folder<'_> {
         let file = std::fs::OpenOptions::new().create(true).append(true).open(&log).map_err(io)?;
         let program = std::env::current_exe().map_err(|e| Error::run(format!("cannot find this program: {e}")))?;
         let mut command = Command::new(program);
-        command.arg("--task").arg(&manifest.path).args(["--index", &index.to_string(), "--threads", &threads.to_string()]);
-        let command = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(file);
+        command.arg("--task").arg(&manifest.path).args(["--index", &index.to_string(), "--threads", &threads.to_string(), "--until-eof"]);
+        let command = command.stdin(Stdio::piped()).stdout(Stdio::null()).stderr(file);
         command.spawn().map_err(|e| Error::run(format!("cannot start a task: {e}")))
     }
 }

@@ -1,6 +1,8 @@
 //! A sweep as written, and the tasks that it comes to.
 
-use crate::recipe::Recipe;
+use crate::job::check_stages;
+use crate::recipe::{Recipe, put};
+use crate::registry::Registry;
 use crate::stages::Scheme;
 use crate::{Error, Result};
 use egogen::io::content_hash;
@@ -72,11 +74,12 @@ pub enum Draw {
     Choice(Vec<toml::Value>),
 }
 
-/// Successive halving: all settings train for the first number of epochs, the best share of them for the second, and so on.
+/// Successive halving: all settings train for the first number of epochs, the best share of them for the second, and so on. Of a
+/// recipe with stages these are epochs of the last one; those before are trained whole in the first rung.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Halving {
-    /// `run.epochs` of each rung, each more than the one before.
+    /// `run.epochs` of each rung, each more than the one before; those of the last stage, where there are stages.
     pub epochs: Vec<u64>,
     /// Share of settings that goes on; at least one does.
     #[serde(default = "half")]
@@ -160,8 +163,6 @@ impl Sweep {
             let rising = !epochs.is_empty() && epochs[0] > 0 && epochs.is_sorted_by(|a, b| a < b);
             need(rising, format!("halving.epochs is {epochs:?}, expected numbers from 1 up, each more than the one before"))?;
             need(*keep > 0.0 && *keep < 1.0, format!("halving.keep is {keep}, expected between 0 and 1"))?;
-            let varied = self.variants.iter().any(|v| v.changes().contains_key("run.epochs"));
-            need(!varied && !self.keys().contains(&"run.epochs"), "run.epochs cannot be swept beside halving, which sets it".into())?;
         }
         Ok(())
     }
@@ -215,21 +216,32 @@ impl Sweep {
         (0..).zip(all).flat_map(drawn).collect()
     }
 
+    /// Refuses what a task would stop at when it begins, be it in the environment that its recipe makes.
+    pub fn check_tasks(&self, registry: &Registry) -> Result<()> {
+        let settings = self.settings();
+        for task in self.tasks(0, &(1..=settings.len()).collect::<Vec<_>>())?.iter().step_by(self.seeds.len()) {
+            let named = |e: Error| Error::config(format!("setting {} {}: {e}", task.setting, task.variant));
+            let scheme = Scheme::new(Recipe::parse(&task.id, &task.recipe, &[])?)?;
+            check_stages(&scheme, registry).map_err(named)?;
+        }
+        Ok(())
+    }
+
     /// The tasks of a rung (from 0) for these settings (numbers from 1), all checked. Without halving there is one rung.
     pub fn tasks(&self, rung: usize, settings: &[usize]) -> Result<Vec<Task>> {
         let all = self.settings();
         let mut tasks = Vec::new();
         for &setting in settings {
             let (variant, changes) = all.get(setting - 1).ok_or_else(|| Error::run(format!("the sweep has no setting {setting}")))?;
-            let mut sets: Vec<String> = changes.iter().map(|(key, value)| format!("{key}={value}")).collect();
-            if let Some(halving) = &self.halving {
-                let epochs = halving.epochs.get(rung).ok_or_else(|| Error::run(format!("the sweep has no rung {rung}")))?;
-                sets.push(format!("run.epochs={epochs}"));
-            }
+            let sets: Vec<String> = changes.iter().map(|(key, value)| format!("{key}={value}")).collect();
             let named = |e: Error| if variant.is_empty() { e } else { Error::config(format!("variant '{variant}': {e}")) };
-            let base = Recipe::load(&self.recipe, &sets).map_err(named)?;
-            if self.halving.is_some() && !base.stages.is_empty() {
-                return Err(Error::config("halving: expected a recipe without stages".to_string()));
+            let mut base = Recipe::load(&self.recipe, &sets).map_err(named)?;
+            if let Some(halving) = &self.halving {
+                let epochs = *halving.epochs.get(rung).ok_or_else(|| Error::run(format!("the sweep has no rung {rung}")))?;
+                let key = set_epochs(&mut base, epochs)?;
+                if changes.contains_key(&key) {
+                    return Err(named(Error::config(format!("{key} cannot be swept beside halving, which sets it"))));
+                }
             }
             for &seed in &self.seeds {
                 let recipe = Scheme::new(Recipe { seed, ..base.clone() }).map_err(named)?.recipe.to_toml()?;
@@ -241,6 +253,18 @@ impl Sweep {
         }
         Ok(tasks)
     }
+}
+
+/// Sets the epochs of a recipe, or of its last stage; gives the key.
+fn set_epochs(recipe: &mut Recipe, epochs: u64) -> Result<String> {
+    let Some(last) = recipe.stages.last_mut() else {
+        recipe.run.epochs = epochs;
+        return Ok("run.epochs".into());
+    };
+    let key = format!("stages.{}.run.epochs", last.name);
+    let value = toml::Value::try_from(epochs).map_err(|e| Error::config(format!("{key}: {e}")))?;
+    put(&mut last.changes, "run.epochs", value).map_err(|e| Error::config(format!("{key}: {e}")))?;
+    Ok(key)
 }
 
 impl Draw {
@@ -353,18 +377,22 @@ mod tests {
             ("[random]\ncount = 1\nkeys = { a = { log = [0.0, 1.0] } }", "random.keys.a"),
             ("[halving]\nepochs = [4, 4]", "halving.epochs"),
             ("[halving]\nepochs = [4]\nkeep = 1.0", "halving.keep"),
-            ("[halving]\nepochs = [4]\n[[variants]]\nname = 'a'\nset = { run.epochs = 1 }", "run.epochs"),
             ("[[variants]]\nname = 'a'\n[[variants]]\nname = 'a'", "'a' is the name of variant 2"),
             ("[[variants]]\nname = ' '", "variant 1"),
             ("[[variants]]\nname = 'a'\nset = { ppo.clip = 0.1 }\n[grid]\n'ppo.clip' = [0.2]", "'a' sets ppo.clip"),
-            ("[halving]\nepochs = [4]\n[grid]\n'run.epochs' = [1]", "run.epochs"),
         ] {
             let e = sweep(text).unwrap_err().to_string();
             assert!(e.contains("sweep.toml") && e.contains(word), "{text}: {e}");
         }
-        let e = sweep("[grid]\n'ppo.clipp' = [0.1]").unwrap().tasks(0, &[1]).unwrap_err().to_string();
-        assert!(e.contains("clipp"), "{e}");
-        let e = sweep("[[variants]]\nname = 'odd'\nset.ppo.clip = 1.5").unwrap().tasks(0, &[1]).unwrap_err().to_string();
-        assert!(e.contains("variant 'odd'") && e.contains("ppo.clip is 1.5"), "{e}");
+        for (text, words) in [
+            ("[grid]\n'ppo.clipp' = [0.1]", ["clipp", "clip"]),
+            ("[[variants]]\nname = 'odd'\nset.ppo.clip = 1.5", ["variant 'odd'", "ppo.clip is 1.5"]),
+            ("[halving]\nepochs = [4]\n[grid]\n'run.epochs' = [1]", ["run.epochs", "halving"]),
+            ("[halving]\nepochs = [4]\n[[variants]]\nname = 'a'\nset = { run.epochs = 1 }", ["variant 'a'", "halving"]),
+            ("[grid]\n'env_options.sise' = [1]", ["setting 1", "sise"]),
+        ] {
+            let e = sweep(text).unwrap().check_tasks(&Registry::standard()).unwrap_err().to_string();
+            assert!(words.iter().all(|w| e.contains(w)), "{text}: {e}");
+        }
     }
 }

@@ -285,3 +285,46 @@ fn engines_get_every_task() {
     let manifest = Manifest::read(&out.join("manifest.jsonl")).unwrap();
     assert!(manifest.tasks.iter().all(|t| matches!(manifest.state(t), State::Done(_))));
 }
+
+/// Runs four tasks by an engine, of which the first is killed, and runs them again: it goes on, and the others are not repeated.
+#[cfg(unix)]
+fn goes_on_after_a_kill(engine: &[&str], options: &[&str]) {
+    let dir = tempfile::tempdir().unwrap();
+    let (out, path) = (dir.path().join("out"), path_with_train(&dir.path().join("bin")));
+    sweep(&files(dir.path(), "[grid]\n'run.epochs' = [150, 2]"), &out, &["--plan"]);
+    let manifest = Manifest::read(&out.join("manifest.jsonl")).unwrap();
+    let start = || {
+        let mut command = Command::new(engine[0]);
+        command.args(&engine[1..]).arg(&manifest.path).args(options).env("PATH", &path).current_dir(scripts());
+        command.spawn().unwrap()
+    };
+    let mut first = start();
+    let runs: Vec<PathBuf> = manifest.tasks.iter().map(|t| manifest.folder(t)).collect();
+    wait_for(|| runs[0].join("checkpoints").exists());
+    let task = format!("^train --task {} --index 0 ", manifest.path.display());
+    assert!(Command::new("pkill").args(["-KILL", "-f", "--", &task]).status().unwrap().success());
+    assert!(!first.wait().unwrap().success());
+    let done: Vec<bool> = manifest.tasks.iter().map(|t| matches!(manifest.state(t), State::Done(_))).collect();
+    assert_eq!(done, [false, true, true, true]);
+    let stamps = || runs[1..].iter().map(|r| fs::metadata(r.join("metrics.csv")).unwrap().modified().unwrap()).collect::<Vec<_>>();
+    let before = stamps();
+    assert!(start().wait().unwrap().success());
+    assert_eq!(stamps(), before);
+    let alone = dir.path().join("alone");
+    succeed(&[text(&dir.path().join("small.toml")), "--set", "run.epochs=150", "--out", text(&alone)]);
+    assert_same_run(&alone, &runs[0], "epoch-0150");
+}
+
+#[cfg(unix)]
+#[test]
+#[ignore = "needs Slurm"]
+fn slurm_goes_on_after_a_kill() {
+    goes_on_after_a_kill(&["sh", "slurm_local.sh", "sh", "slurm.sh"], &["--cpus-per-task=1", "--wait"]);
+}
+
+#[cfg(unix)]
+#[test]
+#[ignore = "needs the Python package hyperqueue"]
+fn hyperqueue_goes_on_after_a_kill() {
+    goes_on_after_a_kill(&["python3", "hyperqueue_local.py"], &["2"]);
+}

@@ -11,4 +11,6 @@ fi
 manifest=$1
 shift
 last=$(($(wc -l < "$manifest") - 1))
-exec sbatch --array="0-$last" "$@" "$0" "$manifest"
+logs=$(dirname "$manifest")/logs
+mkdir -p "$logs"
+exec sbatch --array="0-$last" --output="$logs/slurm-%A_%a.txt" --open-mode=append "$@" "$0" "$manifest"

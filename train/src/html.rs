@@ -16,7 +16,7 @@ table { border-collapse: collapse; margin: .8em 0; }
 th, td { padding: .3em .55em; border-bottom: 1px solid #e6e8eb; text-align: right; vertical-align: top; white-space: nowrap; }
 th { background: #f6f7f8; white-space: normal; vertical-align: bottom; }
 td:first-child, th:first-child { text-align: left; }
-td.text { text-align: left; white-space: normal; }
+td.text, th.text { text-align: left; white-space: normal; }
 small { display: block; color: #747a85; font-size: .82em; }
 .good { color: #2c7a4b; } .bad { color: #b8372e; font-weight: 600; }
 .figures { display: flex; flex-wrap: wrap; gap: 1em; }
@@ -24,6 +24,9 @@ figure { margin: .6em 0; max-width: 100%; }
 figure svg, figure img { max-width: 100%; height: auto; display: block; }
 figcaption { color: #555b66; font-size: .9em; max-width: 62em; }
 ";
+
+/// The class of cells that hold words.
+const WORDS: &str = "text";
 
 /// A page under construction. All text that is given is shown as it is; nothing of it is read as HTML.
 pub struct Page {
@@ -64,7 +67,7 @@ impl Cell {
 
     /// Words, which stand on the left and may be broken into lines.
     pub fn words(text: impl Into<String>) -> Self {
-        Self { text: text.into(), class: "text", ..Self::default() }
+        Self { text: text.into(), class: WORDS, ..Self::default() }
     }
 
     /// Shown as good or bad.
@@ -99,9 +102,11 @@ impl Page {
         self.add(format_args!("<p class=\"warning\">{}</p>\n", escape(text)));
     }
 
-    /// A table; the first column stands on the left.
+    /// A table; the first column stands on the left, and so do heads of words.
     pub fn table(&mut self, head: &[&str], rows: &[Vec<Cell>]) {
-        let heads: String = head.iter().map(|h| format!("<th>{}</th>", escape(h))).collect();
+        let class =
+            |column: usize| rows.first().and_then(|r| r.get(column)).map_or("", |cell| if cell.class == WORDS { WORDS } else { "" });
+        let heads = head.iter().enumerate().map(|(i, h)| format!("<th{}>{}</th>", attribute(class(i)), escape(h))).collect::<String>();
         let row = |row: &Vec<Cell>| format!("<tr>{}</tr>\n", row.iter().map(cell).collect::<String>());
         let rows: String = rows.iter().map(row).collect();
         self.add(format_args!("<div class=\"scroll\"><table>\n<tr>{heads}</tr>\n{rows}</table></div>\n"));
@@ -126,8 +131,12 @@ impl Page {
     }
 }
 
+fn attribute(class: &str) -> String {
+    if class.is_empty() { String::new() } else { format!(" class=\"{class}\"") }
+}
+
 fn cell(cell: &Cell) -> String {
-    let class = if cell.class.is_empty() { String::new() } else { format!(" class=\"{}\"", cell.class) };
+    let class = attribute(cell.class);
     let note = if cell.note.is_empty() { String::new() } else { format!("<small>{}</small>", escape(&cell.note)) };
     format!("<td{class}>{}{note}</td>", escape(&cell.text))
 }
@@ -175,6 +184,7 @@ mod tests {
         page.section("<script>");
         page.warning("\"quoted\" & 'so'");
         page.table(&["name", "value"], &[vec!["x".into(), Cell::from("1").note("0 > 2")], vec!["y".into(), Cell::verdict("2", false)]]);
+        page.table(&["name", "why"], &[vec!["x".into(), Cell::words("<so>")]]);
         page.figures(&[(Picture::Png(b"foo".to_vec()), "<b>"), (Picture::Svg("<svg></svg>".into()), "plain")]);
         let html = page.finish();
         assert!(html.starts_with("<!doctype html>") && html.ends_with("</html>\n"));
@@ -184,6 +194,8 @@ mod tests {
             "&quot;quoted&quot; &amp; &#39;so&#39;",
             "<td>1<small>0 &gt; 2</small></td>",
             "<td class=\"bad\">2</td>",
+            "<th>value</th>",
+            "<th class=\"text\">why</th></tr>\n<tr><td>x</td><td class=\"text\">&lt;so&gt;</td>",
             "src=\"data:image/png;base64,Zm9v\"",
             "<figure><svg></svg><figcaption>plain",
         ] {

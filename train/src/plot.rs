@@ -38,8 +38,16 @@ pub struct Series {
     pub name: String,
     /// (x, y) in the order of x.
     pub points: Vec<(f64, f64)>,
-    /// Half the height of the band around each point; empty for none.
-    pub spread: Vec<f64>,
+    pub band: Option<Band>,
+}
+
+/// A band around a line.
+#[derive(Clone, Debug)]
+pub struct Band {
+    /// Half its height at each point.
+    pub half: Vec<f64>,
+    /// What the legend calls it, such as "standard error".
+    pub what: &'static str,
 }
 
 /// What stands on lines, beside them.
@@ -74,31 +82,36 @@ pub fn lines(titles: Titles, y: Range<f64>, series: &[Series]) -> Result<String>
 
 /// [`lines`] with marks: borders dashed, chosen points as rings.
 pub fn marked_lines(titles: Titles, y: Range<f64>, series: &[Series], marks: &Marks) -> Result<String> {
-    let band = |s: &Series| {
-        let half = s.spread.iter().copied().chain(std::iter::repeat(0.0));
-        s.points.iter().zip(half).map(|(&(x, y), d)| (x, y - d, y + d)).collect::<Vec<_>>()
-    };
-    let all: Vec<_> = series.iter().flat_map(band).collect();
+    let all: Vec<_> = series.iter().flat_map(|s| s.points.iter().copied()).collect();
     let x = all.iter().fold(f64::MAX..f64::MIN, |r, p| r.start.min(p.0)..r.end.max(p.0));
-    let y = wide(all.iter().fold(y, |r, p| r.start.min(p.1)..r.end.max(p.2)));
-    svg(SIZE, |root| {
-        let mut chart = chart(titles).build_on(root, wide(x), y.clone())?;
+    let lines = wide(all.iter().fold(y, |r, p| r.start.min(p.1)..r.end.max(p.1)));
+    // A band may take twice the height of the lines; one that is higher still ends at the edge.
+    let span = lines.end - lines.start;
+    let (low, high) = (lines.start - 0.5 * span, lines.end + 0.5 * span);
+    let edges = |s: &Series| -> Vec<(f64, f64, f64)> {
+        let half = s.band.iter().flat_map(|b| b.half.iter().copied());
+        s.points.iter().zip(half).map(|(&(x, y), d)| (x, (y - d).max(low), (y + d).min(high))).collect()
+    };
+    let y = series.iter().flat_map(edges).fold(lines, |r, p| r.start.min(p.1)..r.end.max(p.2));
+    let edge = 0.04 * (y.end - y.start);
+    let y = y.start - edge..y.end + edge;
+    let keys = keys(series);
+    svg((SIZE.0, SIZE.1 + legend_height(&keys)), |root| {
+        let (upper, lower) = root.split_vertically(SIZE.1);
+        let mut chart = chart(titles).build_on(&upper, wide(x), y.clone())?;
         for &at in &marks.borders {
             chart.draw_series(DashedLineSeries::new([(at, y.start), (at, y.end)], 4, 4, RGBColor(90, 90, 90).into()))?;
         }
         for (s, colour) in series.iter().zip(COLOURS.iter().cycle()) {
-            if !s.spread.is_empty() {
-                let (low, high): (Vec<_>, Vec<_>) = band(s).into_iter().map(|(x, a, b)| ((x, a), (x, b))).unzip();
+            if s.band.is_some() {
+                let (low, high): (Vec<_>, Vec<_>) = edges(s).into_iter().map(|(x, a, b)| ((x, a), (x, b))).unzip();
                 let ring: Vec<_> = low.into_iter().chain(high.into_iter().rev()).collect();
                 chart.draw_series([Polygon::new(ring, colour.mix(0.18))])?;
             }
-            let line = chart.draw_series(LineSeries::new(s.points.iter().copied(), colour.stroke_width(2)))?;
-            if !s.name.is_empty() {
-                named(line, &s.name, *colour);
-            }
+            chart.draw_series(LineSeries::new(s.points.iter().copied(), colour.stroke_width(2)))?;
         }
         chart.draw_series(marks.chosen.iter().map(|&at| Circle::new(at, 5, BLACK.stroke_width(2))))?;
-        legend(&mut chart)
+        legend(&lower, &keys)
     })
 }
 
@@ -115,17 +128,17 @@ pub fn histogram(titles: Titles, x: Range<f64>, counts: &[(&str, &[f64])]) -> Re
         c.iter().map(|v| v / sum).collect::<Vec<_>>()
     };
     let top = counts.iter().flat_map(|(_, c)| shares(c)).fold(0.01, f64::max);
-    // Room for the legend.
-    let top = top * (1.1 + 0.09 * counts.len() as f64);
-    svg(SIZE, |root| {
-        let mut chart = chart(titles).build_on(root, x.clone(), 0.0..top)?;
-        for ((name, c), colour) in counts.iter().zip(COLOURS.iter().cycle()) {
+    let keys: Vec<Key> = counts.iter().zip(COLOURS.iter().cycle()).map(|((name, _), c)| Key::new(name, Some(*c))).collect();
+    svg((SIZE.0, SIZE.1 + legend_height(&keys)), |root| {
+        let (upper, lower) = root.split_vertically(SIZE.1);
+        let mut chart = chart(titles).build_on(&upper, x.clone(), 0.0..1.05 * top)?;
+        for ((_, c), colour) in counts.iter().zip(COLOURS.iter().cycle()) {
             let width = (x.end - x.start) / c.len() as f64;
             let edge = |i: usize| x.start + width * i as f64;
             let steps: Vec<_> = shares(c).into_iter().enumerate().flat_map(|(i, s)| [(edge(i), s), (edge(i + 1), s)]).collect();
-            named(chart.draw_series(LineSeries::new(steps, colour.stroke_width(2)))?, name, *colour);
+            chart.draw_series(LineSeries::new(steps, colour.stroke_width(2)))?;
         }
-        legend(&mut chart)
+        legend(&lower, &keys)
     })
 }
 
@@ -179,6 +192,7 @@ impl Blank<'_> {
         x: Range<f64>,
         y: Range<f64>,
     ) -> std::result::Result<Chart<'a, 'b>, DrawingAreaErrorKind<<SVGBackend<'a> as DrawingBackend>::ErrorType>> {
+        let ranges = [x.clone(), y.clone()];
         let mut chart = ChartBuilder::on(area)
             .caption(self.titles.title, ("sans-serif", 15))
             .margin(6)
@@ -186,18 +200,89 @@ impl Blank<'_> {
             .x_label_area_size(34)
             .y_label_area_size(48)
             .build_cartesian_2d(x, y)?;
-        chart.configure_mesh().x_desc(self.titles.x).y_desc(self.titles.y).x_labels(5).y_labels(6).light_line_style(WHITE).draw()?;
+        let [in_x, in_y] = ranges.map(|r| move |v: &f64| label(*v, r.end - r.start));
+        let mut mesh = chart.configure_mesh();
+        mesh.x_label_formatter(&in_x)
+            .y_label_formatter(&in_y)
+            .x_desc(self.titles.x)
+            .y_desc(self.titles.y)
+            .x_labels(5)
+            .y_labels(6)
+            .light_line_style(WHITE)
+            .draw()?;
         Ok(chart)
     }
 }
 
-fn named<'a>(series: &mut plotters::chart::SeriesAnno<'a, SVGBackend<'_>>, name: &str, colour: RGBColor) {
-    series.label(name).legend(move |(x, y)| PathElement::new(vec![(x, y), (x + 14, y)], colour.stroke_width(2)));
+/// A number on an axis of this length: no more digits than say something.
+fn label(value: f64, span: f64) -> String {
+    let value = if value.abs() < 1e-6 * span { 0.0 } else { value };
+    format!("{value:.5e}").parse::<f64>().map_or_else(|_| value.to_string(), |v| v.to_string())
 }
 
-fn legend<'a: 'b, 'b>(chart: &mut Chart<'a, 'b>) -> Drawn<'a> {
-    let mut labels = chart.configure_series_labels();
-    labels.position(SeriesLabelPosition::UpperRight).label_font(("sans-serif", 12)).background_style(WHITE.mix(0.8)).draw()
+/// Height of a line of a legend, of which a letter is so wide at least, in pixels.
+const LINE: i32 = 16;
+const LETTER: f64 = 6.3;
+/// Where a legend's names begin after their marks, and the next mark after a name.
+const MARK: i32 = 20;
+const GAP: i32 = 12;
+
+/// An entry of a legend: a line of this colour, or a band.
+struct Key {
+    name: String,
+    colour: Option<RGBColor>,
+}
+
+impl Key {
+    fn new(name: &str, colour: Option<RGBColor>) -> Self {
+        let most = (f64::from(SIZE.0 as i32 - MARK - 2 * GAP) / LETTER) as usize;
+        let short = name.chars().count() > most;
+        let name = if short { name.chars().take(most - 3).chain("...".chars()).collect() } else { name.into() };
+        Self { name, colour }
+    }
+
+    fn width(&self) -> i32 {
+        MARK + (LETTER * self.name.chars().count() as f64).ceil() as i32
+    }
+}
+
+/// The legend of lines: their names, and once what each kind of band is.
+fn keys(series: &[Series]) -> Vec<Key> {
+    let named = series.iter().zip(COLOURS.iter().cycle()).filter(|(s, _)| !s.name.is_empty());
+    let mut keys: Vec<Key> = named.map(|(s, colour)| Key::new(&s.name, Some(*colour))).collect();
+    let mut bands: Vec<&str> = series.iter().filter_map(|s| Some(s.band.as_ref()?.what)).collect();
+    bands.dedup();
+    keys.extend(bands.into_iter().map(|what| Key::new(what, None)));
+    keys
+}
+/// Upper left corners of the entries of a legend, in lines as wide as the picture.
+fn places(keys: &[Key]) -> Vec<(i32, i32)> {
+    let mut at = (GAP, 0);
+    let place = |key: &Key| {
+        if at.0 > GAP && at.0 + key.width() > SIZE.0 as i32 {
+            at = (GAP, at.1 + LINE);
+        }
+        let place = at;
+        at.0 += key.width() + GAP;
+        place
+    };
+    keys.iter().map(place).collect()
+}
+
+/// Pixels that a legend takes below the plot.
+fn legend_height(keys: &[Key]) -> u32 {
+    places(keys).last().map_or(0, |at| (at.1 + LINE + 4) as u32)
+}
+
+fn legend<'a>(area: &Area<'a>, keys: &[Key]) -> Drawn<'a> {
+    for (key, (x, y)) in keys.iter().zip(places(keys)) {
+        match key.colour {
+            Some(colour) => area.draw(&PathElement::new(vec![(x, y + 6), (x + 14, y + 6)], colour.stroke_width(2)))?,
+            None => area.draw(&Rectangle::new([(x, y + 1), (x + 14, y + 11)], BLACK.mix(0.18).filled()))?,
+        }
+        area.draw(&Text::new(key.name.as_str(), (x + MARK, y), ("sans-serif", 11)))?;
+    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -206,12 +291,56 @@ mod tests {
 
     const TITLES: Titles = Titles { title: "drift", x: "primitives", y: "cm" };
 
+    /// y of every element that is named, by what stands in its line.
+    fn heights(plot: &str, element: &str) -> Vec<f64> {
+        let y = |line: &str| line.split(" y=\"").nth(1)?.split('"').next()?.parse().ok();
+        plot.lines().filter(|l| l.starts_with(&format!("<{element}"))).filter_map(y).collect()
+    }
+
+    #[test]
+    fn legends_lie_below_the_plot() {
+        let named = |name: &str| Series { name: name.into(), points: vec![(0.0, 1.0), (1.0, 2.0)], band: None };
+        let height = |names: &[&str]| {
+            let plot = lines(TITLES, 0.0..1.0, &names.iter().map(|n| named(n)).collect::<Vec<_>>()).unwrap();
+            let low = heights(&plot, "text").iter().filter(|y| **y >= f64::from(SIZE.1)).count();
+            assert_eq!(low, names.iter().filter(|n| !n.is_empty()).count(), "{plot}");
+            plot.split("height=\"").nth(1).unwrap().split('"').next().unwrap().parse::<u32>().unwrap() - SIZE.1
+        };
+        let long = "x".repeat(200);
+        assert_eq!(
+            [height(&[""]), height(&["a", "b"]), height(&[&long, "b"])],
+            [0, 20, 36],
+            "a name that is too long has a line of its own"
+        );
+    }
+
+    #[test]
+    fn numbers_on_axes_are_short() {
+        let labels = [(10.0, 20.0), (0.1 + 0.2, 1.0), (-1e-17, 1.0), (3e-7, 1e-6), (0.09885, 0.0004)].map(|(v, span)| label(v, span));
+        assert_eq!(labels, ["10", "0.3", "0", "0.0000003", "0.09885"]);
+    }
+
+    #[test]
+    fn a_wide_band_leaves_the_line_its_shape() {
+        let rise = |half: f64| {
+            let band = Some(Band { half: vec![half; 2], what: "" });
+            let plot = lines(TITLES, 1.0..1.0, &[Series { name: String::new(), points: vec![(0.0, 1.0), (1.0, 2.0)], band }]).unwrap();
+            let line = plot.lines().find(|l| l.starts_with("<polyline") && l.contains("#3464B4")).unwrap();
+            let points = line.split("points=\"").nth(1).unwrap().split('"').next().unwrap();
+            let y: Vec<f64> = points.split_whitespace().map(|p| p.split(',').nth(1).unwrap().parse().unwrap()).collect();
+            y[0] - y[1]
+        };
+        let (narrow, wide, wider) = (rise(0.0), rise(1.0), rise(100.0));
+        assert!(wide == wider && (wide / narrow - 0.5).abs() < 0.02, "{narrow}, {wide}, {wider}");
+    }
+
     #[test]
     fn plots_hold_what_they_are_given() {
-        let series = Series { name: "feet <1>".into(), points: vec![(0.0, 1.0), (1.0, 2.0)], spread: vec![0.5, 0.25] };
+        let band = Some(Band { half: vec![0.5, 0.25], what: "standard error" });
+        let series = Series { name: "feet <1>".into(), points: vec![(0.0, 1.0), (1.0, 2.0)], band };
         let plot = lines(TITLES, 0.0..1.0, &[series]).unwrap();
-        assert!(plot.starts_with("<svg") && plot.contains("polygon") && plot.contains("drift") && plot.contains("feet &lt;1&gt;"));
-        let series = Series { name: String::new(), points: vec![(0.0, 1.0), (4.0, 2.0)], spread: vec![] };
+        assert!(plot.starts_with("<svg") && ["polygon", "drift", "feet &lt;1&gt;", "standard error"].iter().all(|w| plot.contains(w)));
+        let series = Series { name: String::new(), points: vec![(0.0, 1.0), (4.0, 2.0)], band: None };
         let marks = Marks { borders: vec![2.0], chosen: vec![(4.0, 2.0)] };
         let circles =
             |marks: &Marks| marked_lines(TITLES, 0.0..1.0, std::slice::from_ref(&series), marks).unwrap().matches("<circle").count();

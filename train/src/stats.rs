@@ -37,15 +37,26 @@ pub fn bootstrap_interval(strata: &[Vec<f64>], resamples: usize, rng: &mut Strea
     })
 }
 
-/// Standard normal quantile of a two-sided 95 % interval.
-const Z: f64 = 1.96;
+/// Quantile of Student's t for a two-sided 95 % interval with these degrees of freedom: tables up to 9, then the expansion in their
+/// inverse (Abramowitz & Stegun 26.7.5).
+fn student(freedom: usize) -> f64 {
+    const FIRST: [f64; 9] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262];
+    let (z, n) = (1.959_964f64, freedom as f64);
+    let terms = [
+        (z.powi(3) + z) / 4.0,
+        (5.0 * z.powi(5) + 16.0 * z.powi(3) + 3.0 * z) / 96.0,
+        (3.0 * z.powi(7) + 19.0 * z.powi(5) + 17.0 * z.powi(3) - 15.0 * z) / 384.0,
+    ];
+    let expansion = z + terms[0] / n + terms[1] / n.powi(2) + terms[2] / n.powi(3);
+    freedom.checked_sub(1).map_or(0.0, |i| FIRST.get(i).copied().unwrap_or(expansion))
+}
 
-/// Mean, and half its 95 % interval by the normal, which is 0 for one value; none without values.
+/// Mean, and half its 95 % interval by Student's t, which is 0 for one value; none without values.
 pub fn mean_and_half(values: &[f64]) -> Option<[f64; 2]> {
     let n = values.len() as f64;
     let mean = values.iter().sum::<f64>() / n;
     let square = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n - 1.0).max(1.0);
-    (!values.is_empty()).then(|| [mean, Z * (square / n).sqrt()])
+    (!values.is_empty()).then(|| [mean, student(values.len() - 1) * (square / n).sqrt()])
 }
 
 /// Named figures in the order of the columns; `None` where an epoch has none.
@@ -192,6 +203,10 @@ mod tests {
         assert_eq!((mean_and_half(&[]), mean_and_half(&[3.0])), (None, Some([3.0, 0.0])));
         // Deviations -1, 0, 1: variance 1, standard error 1 / sqrt 3.
         let [mean, half] = mean_and_half(&[1.0, 2.0, 3.0]).unwrap();
-        assert!(mean == 2.0 && (half - 1.96 / 3f64.sqrt()).abs() < 1e-12);
+        assert!(mean == 2.0 && (half - 4.303 / 3f64.sqrt()).abs() < 1e-12);
+        // Tables of Student's t.
+        for (freedom, want) in [(1, 12.706), (9, 2.262), (10, 2.228), (15, 2.131), (30, 2.042), (120, 1.980)] {
+            assert!((student(freedom) - want).abs() < 6e-4, "{freedom}: {}", student(freedom));
+        }
     }
 }

@@ -5,7 +5,7 @@ use super::pictures::{failures, plans, worst};
 use super::{Estimate, Fate, Played, Row, Setup};
 use crate::Result;
 use crate::html::{Cell, Page, Picture};
-use crate::plot::{Series, Titles, histogram, lines};
+use crate::plot::{Band, Series, Titles, histogram, lines};
 use egogen::motion::FPS;
 use egogen_envs::motion::TERMS;
 use std::collections::BTreeMap;
@@ -126,12 +126,12 @@ fn distances(o: &Outcome) -> Result<(String, String)> {
         Series {
             name: row.name.clone(),
             points: points.iter().map(|p| (p.0, p.1[0])).collect(),
-            spread: points.iter().map(|p| p.1[1]).collect(),
+            band: Some(Band { half: points.iter().map(|p| p.1[1]).collect(), what: "standard error" }),
         }
     };
     let all: Vec<Series> = o.rows.iter().zip(o.played).map(series).collect();
     let titles = Titles { title: "distance to the goal", x: "seconds", y: "m" };
-    Ok((lines(titles, 0.0..0.5, &all)?, "Mean over the people, the band one standard error; who has ended keeps its last distance.".into()))
+    Ok((lines(titles, 0.0..0.5, &all)?, "Mean over the people; who has ended keeps its last distance.".into()))
 }
 
 fn way_left(p: &Played) -> Option<Vec<f32>> {
@@ -156,7 +156,7 @@ fn rewards(o: &Outcome) -> Result<(String, String)> {
         points: (0..longest)
             .map(|s| (s as f64 + 1.0, spread(played.iter().filter_map(|p| p.terms.get(s * width + k).copied()))[0]))
             .collect(),
-        spread: vec![],
+        band: None,
     };
     let all: Vec<Series> = (0..width).map(term).filter(|s| s.points.iter().any(|p| p.1.abs() > 1e-6)).collect();
     let titles = Titles { title: "reward terms", x: "step", y: "weighted" };

@@ -34,7 +34,7 @@ pub fn page(groups: &[Group], registry: &Registry, starts: usize, command: &str)
     let panels = Panels { groups };
     page.section("Learning");
     page.text(&format!(
-        "Over epochs. {}Where a folder holds several seeds, a line is their mean and the band its 95 % interval (1.96 standard errors). \
+        "Over epochs. {}Where a folder holds several seeds, a line is their mean and the band its 95 % interval (Student's t). \
          Dashed: borders between stages. Rings: the policies that were chosen.",
         stages_text(groups)
     ));
@@ -185,7 +185,7 @@ fn selected(page: &mut Page, selection: &Selection) -> Result<()> {
         let points: Vec<(f64, f64)> = (selection.candidates.entries.iter()).filter_map(|e| Some((e.epoch as f64, of(e)?.value))).collect();
         let Some(&(_, first)) = points.first() else { continue };
         let chosen = points.iter().filter(|p| p.0 == selection.epoch as f64).copied().collect();
-        let series = Series { name: String::new(), points, spread: vec![] };
+        let series = Series { name: String::new(), points, band: None };
         let marks = Marks { borders: vec![], chosen };
         pictures.push(Picture::Svg(marked_lines(Titles { title, x: "epoch of the candidate", y }, first..first, &[series], &marks)?));
     }

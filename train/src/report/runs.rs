@@ -2,7 +2,7 @@
 
 use crate::job::{Summary, stage_folder};
 use crate::logger::Columns;
-use crate::plot::{Marks, Series};
+use crate::plot::{Band, Marks, Series};
 use crate::recipe::{Recipe, of_run};
 use crate::select::Selection;
 use crate::stages::Scheme;
@@ -84,19 +84,19 @@ impl Group {
 
     /// The column over epochs: mean over the runs that have a value, and half the 95 % interval of that mean.
     pub fn curve(&self, name: &str, from: From, column: &str) -> Series {
-        let (mut points, mut spread) = (Vec::new(), Vec::new());
+        let (mut points, mut band) = (Vec::new(), Vec::new());
         for (k, ends) in self.borders().windows(2).enumerate() {
             for row in 0..(ends[1] - ends[0]) as usize {
                 let values: Vec<f64> = self.runs.iter().filter_map(|r| r.stages.get(k)?.of(from).get(column, row)).collect();
                 if let Some([mean, half]) = mean_and_half(&values) {
                     points.push((ends[0] + row as f64 + 1.0, mean));
-                    spread.push(half);
+                    band.push(half);
                 }
             }
         }
         // A band of no height is none.
-        let spread = if spread.iter().any(|s| *s > 0.0) { spread } else { vec![] };
-        Series { name: name.into(), points, spread }
+        let band = band.iter().any(|d| *d > 0.0).then_some(Band { half: band, what: "95 % interval over seeds" });
+        Series { name: name.into(), points, band }
     }
 
     /// Borders between stages, and where the chosen policies lie on a column.

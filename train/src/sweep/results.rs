@@ -6,10 +6,12 @@ use crate::Result;
 use crate::html::{Cell, Page, Picture};
 use crate::plot::{Marks, Series, Titles, marked_lines};
 use crate::report::{Group, curve_of};
+use crate::stats::mean_and_half;
 use egogen::io::write_atomic;
+use std::collections::BTreeMap;
 
 /// Settings whose curves the page shows.
-const CURVES: usize = 4;
+const CURVES: usize = 8;
 /// The column of the names of variants.
 const VARIANT: &str = "variant";
 
@@ -23,7 +25,9 @@ pub struct Setting {
     /// Rungs it got to, from 1, and the epochs of its last done task.
     pub rung: usize,
     pub epochs: u64,
-    /// Mean of the figure over the seeds that have it, and half its 95 % interval.
+    /// The figure of every seed that has it.
+    pub values: BTreeMap<u64, f64>,
+    /// Mean of those, and half its 95 % interval.
     pub mean: Option<[f64; 2]>,
     pub done: usize,
     pub tasks: usize,
@@ -32,22 +36,20 @@ pub struct Setting {
 /// The settings of a manifest, by the figure, larger first; those without one last.
 pub fn ranked(manifest: &Manifest, figure: &str) -> Vec<Setting> {
     let mut settings: Vec<Setting> = Vec::new();
-    let mut values: Vec<Vec<f64>> = Vec::new();
     for task in &manifest.tasks {
         if settings.last().is_none_or(|s| s.number != task.setting) {
             let (number, variant, changes) = (task.setting, task.variant.clone(), task.changes.clone());
-            settings.push(Setting { number, variant, changes, rung: 1, epochs: 0, mean: None, done: 0, tasks: 0 });
-            values.push(vec![]);
+            settings.push(Setting { number, variant, changes, rung: 1, epochs: 0, values: BTreeMap::new(), mean: None, done: 0, tasks: 0 });
         }
-        let (Some(setting), Some(values)) = (settings.last_mut(), values.last_mut()) else { continue };
+        let Some(setting) = settings.last_mut() else { continue };
         setting.tasks += 1;
         if let State::Done(done) = manifest.state(task) {
             setting.done += 1;
             setting.epochs = setting.epochs.max(done.epochs);
-            values.extend(done.figures.get(figure));
+            setting.values.extend(done.figures.get(figure).map(|v| (task.seed, *v)));
         }
     }
-    settings.iter_mut().zip(&values).for_each(|(s, v)| s.mean = crate::stats::mean_and_half(v));
+    settings.iter_mut().for_each(|s| s.mean = mean_and_half(&s.values.values().copied().collect::<Vec<_>>()));
     settings.sort_by(|a, b| {
         let value = |s: &Setting| s.mean.map_or(f64::NEG_INFINITY, |m| m[0]);
         value(b).total_cmp(&value(a)).then(a.number.cmp(&b.number))
@@ -56,6 +58,12 @@ pub fn ranked(manifest: &Manifest, figure: &str) -> Vec<Setting> {
 }
 
 impl Setting {
+    /// Mean of the figure less that of another setting on the seeds that both have, and half its 95 % interval.
+    fn less(&self, other: &Self) -> Option<[f64; 2]> {
+        let differences: Vec<f64> = self.values.iter().filter_map(|(seed, v)| Some(v - other.values.get(seed)?)).collect();
+        mean_and_half(&differences)
+    }
+
     /// What the setting has in a column of the table: the name of its variant, or the value of a key.
     fn cell(&self, column: &str) -> String {
         if column == VARIANT { self.variant.clone() } else { self.changes.get(column).map_or(String::new(), |v| v.to_string()) }
@@ -103,18 +111,31 @@ impl Folder<'_> {
         let figure = &self.sweep.figure;
         let mut page = Page::new("Sweep");
         page.text(&format!(
-            "{} settings of the recipe {}, each with {} seeds; by {figure} at the end: mean over seeds, and its 95 % interval (1.96 standard \
-             errors). Where rungs differ, later ones come first.",
+            "{} settings of the recipe {}, each with {} seeds; by {figure} at the end: mean over seeds, and its 95 % interval (Student's \
+             t). The best comes first; \"less the best\" is the mean difference on the same seeds. Where rungs differ, later ones come first.",
             self.sweep.settings().len(),
             self.sweep.recipe,
             self.sweep.seeds.len()
         ));
-        let heads: Vec<&str> =
-            ["setting"].into_iter().chain(keys.iter().copied()).chain([figure.as_str(), "epochs", "rung", "done"]).collect();
+        let heads: Vec<&str> = ["setting"]
+            .into_iter()
+            .chain(keys.iter().copied())
+            .chain([figure.as_str(), "less the best", "epochs", "rung", "done"])
+            .collect();
+        let best = settings.first().filter(|s| s.mean.is_some());
+        let with_half = |mean: Option<[f64; 2]>, seeds: usize| match mean {
+            Some([mean, half]) => {
+                Cell::from(format!("{mean:.4}")).note(if seeds > 1 { format!("± {half:.4}") } else { "one seed".into() })
+            }
+            None => "-".into(),
+        };
         let row = |s: &Setting| {
-            let mut row: Vec<Cell> = vec![format!("{:03}", s.number).into()];
+            let is_best = best.is_some_and(|b| b.number == s.number);
+            let number = format!("{:03}", s.number);
+            let mut row = vec![if is_best { Cell::verdict(number, true).note("best") } else { number.into() }];
             row.extend(keys.iter().map(|key| Cell::words(s.cell(key))));
-            row.push(s.mean.map_or("-".into(), |[mean, half]| Cell::from(format!("{mean:.4}")).note(format!("± {half:.4}"))));
+            let less = best.filter(|b| !is_best && b.rung == s.rung).and_then(|b| s.less(b));
+            row.extend([with_half(s.mean, s.values.len()), with_half(less, s.values.len())]);
             row.extend([Cell::from(s.epochs.to_string()), s.rung.to_string().into()]);
             row.push(Cell::verdict(format!("{} of {}", s.done, s.tasks), s.done == s.tasks));
             row
@@ -123,7 +144,9 @@ impl Folder<'_> {
         if !self.sweep.variants.is_empty() {
             page.section("Variants");
             let sets = |changes: Changes| changes.iter().map(|(key, value)| format!("{key} = {value}")).collect::<Vec<_>>().join(", ");
-            let row = |v: &Variant| vec![Cell::from(v.name.as_str()), Cell::words(sets(v.changes()))];
+            let row = |v: &Variant| {
+                vec![Cell::from(v.name.as_str()), Cell::words(if v.set.is_empty() { "nothing".into() } else { sets(v.changes()) })]
+            };
             page.table(&["variant", "sets"], &self.sweep.variants.iter().map(row).collect::<Vec<_>>());
         }
         self.curves(&mut page, settings)?;
@@ -153,7 +176,7 @@ impl Folder<'_> {
         let Some(&(_, first)) = series.first().and_then(|s| s.points.first()) else { return Ok(()) };
         page.section("The first settings over epochs");
         let plot = marked_lines(Titles { title: figure, x: "epoch", y: "" }, first..first, &series, &Marks::default())?;
-        page.figures(&[(Picture::Svg(plot), "Mean over seeds; bands are 95 % intervals. More of a setting: train report settings/NNN.")]);
+        page.figures(&[(Picture::Svg(plot), "Mean over seeds. More of a setting: train report settings/NNN.")]);
         Ok(())
     }
 }

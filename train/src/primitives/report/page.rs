@@ -5,7 +5,7 @@ use super::{Coverage, FIGURES, Measured, Pictures, Report};
 use crate::Result;
 use crate::evaluate::Estimate;
 use crate::html::{Cell, Page, Picture};
-use crate::plot::{Series, Titles, histogram, lines, map, ways};
+use crate::plot::{Band, Series, Titles, histogram, lines, map, ways};
 use crate::primitives::export::strip;
 use egogen::body::BodyModel;
 
@@ -14,6 +14,8 @@ const PANELS: usize = 8;
 const PANEL: usize = 140;
 /// Half the width of the plans of ways, metres.
 const PLAN: f64 = 6.0;
+/// What bands show.
+const DEVIATION: &str = "standard deviation";
 
 /// The page; `command` is what made it.
 pub fn page(report: &Report, pictures: &Pictures, body: &BodyModel, command: &str) -> Result<String> {
@@ -112,15 +114,15 @@ fn drift(page: &mut Page, report: &Report) -> Result<()> {
         let reasons: Vec<String> = report.collapsed.iter().map(|(why, n)| format!("{n} by {why}")).collect();
         page.warning(&format!("People who collapsed, by the first reason: {}.", reasons.join(", ")));
     }
-    let series = |name: &str, of: &dyn Fn(&super::Drift) -> [f32; 2]| Series {
-        name: name.into(),
+    let series = |what: &'static str, of: &dyn Fn(&super::Drift) -> [f32; 2]| Series {
+        name: "mean".into(),
         points: report.drift.iter().map(|d| (d.primitive as f64, f64::from(of(d)[0]))).collect(),
-        spread: report.drift.iter().map(|d| f64::from(of(d)[1])).collect(),
+        band: (!what.is_empty()).then(|| Band { half: report.drift.iter().map(|d| f64::from(of(d)[1])).collect(), what }),
     };
     let plot = |title: &str, y: &str, range, s: Series| lines(Titles { title, x: "primitives", y }, range, &[s]);
-    let feet = plot("lowest foot marker", "cm", 0.0..5.0, series("mean, deviation", &|d| d.foot))?;
-    let pelvis = plot("height of the pelvis", "m", 0.75..1.0, series("mean, deviation", &|d| d.pelvis))?;
-    let bones = plot("bone error", "mm", 0.0..6.0, series("mean", &|d| [d.shape, 0.0]))?;
+    let feet = plot("lowest foot marker", "cm", 0.0..5.0, series(DEVIATION, &|d| d.foot))?;
+    let pelvis = plot("height of the pelvis", "m", 0.75..1.0, series(DEVIATION, &|d| d.pelvis))?;
+    let bones = plot("bone error", "mm", 0.0..6.0, series("", &|d| [d.shape, 0.0]))?;
     page.figures(&[(Picture::Svg(feet), ""), (Picture::Svg(pelvis), ""), (Picture::Svg(bones), "")]);
     Ok(())
 }

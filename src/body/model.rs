@@ -37,6 +37,11 @@ impl Skinning {
         &self.entries[start..self.ends[i]]
     }
 
+    /// What bone `k` weighs in vertex `i`.
+    pub fn weight(&self, i: usize, k: usize) -> f32 {
+        self.of(i).iter().filter(|e| e.0 == k).map(|e| e.1).sum()
+    }
+
     /// Weights of vertex `i` by joint, bones counted to the joint that carries them; `carriers`: [`Extra::parents`].
     fn by_joint(&self, i: usize, carriers: &[usize]) -> [f32; JOINTS] {
         let mut weights = [0.0; JOINTS];

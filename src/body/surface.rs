@@ -3,7 +3,8 @@
 use super::extra::correct;
 use super::parts::Part;
 use super::{BODY_JOINTS, BodyModel, Frame, JOINTS, PARAMS, Posed, ShapedBody};
-use glam::{Affine3A, Vec3, Vec3A};
+use crate::kernels::{Bone, Group, LANES, Lanes, Pulls};
+use glam::{Affine3A, Vec3};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -14,12 +15,12 @@ const SMPLX_HANDS: f32 = 1556.0;
 const SMPLX_REST: f32 = 10475.0 - SMPLX_HEAD - SMPLX_HANDS - 502.0;
 /// Vertices of SMPL-X itself, each of which counts once.
 const SMPLX: usize = 10475;
-/// Most points of a cluster.
-const CLUSTER: usize = 12;
 /// Frames in which parts are passed over together.
 const BLOCK: usize = 5;
 /// How far pose correctives may move a point, metres.
 const CORRECTIVE: f32 = 0.06;
+/// How far rounding may, metres.
+const ROUNDING: f32 = 1e-4;
 
 /// Which points are looked at.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,25 +38,36 @@ pub enum Points {
 #[derive(Clone)]
 pub struct Surface {
     model: Arc<BodyModel>,
-    /// Vertex and weight, cluster by cluster.
+    /// Vertex and weight, [`LANES`] for each cluster; where it has fewer points, the last once more without weight.
     points: Vec<(usize, f32)>,
-    clusters: Vec<Range<usize>>,
-    /// Bones that move each cluster.
-    bones: Vec<Vec<usize>>,
-    /// Bones of each point and their weights, where those of point i end at `ends[i]`.
-    skin: Vec<(u32, f32)>,
-    ends: Vec<usize>,
-    /// Body parts with their clusters.
-    parts: Vec<(Part, Range<usize>)>,
+    /// The weights, cluster by cluster.
+    weights: Vec<Lanes>,
+    /// Bones of each cluster and what they weigh in each point.
+    skin: Pulls,
+    /// Bones of [`LANES`] clusters and what they weigh in the middle of each.
+    middles: Pulls,
+    /// The same bones, and how much their weights differ within each cluster; see [`ShapedSurface::inside`].
+    spreads: Pulls,
+    regions: Vec<Region>,
+}
+
+/// A body part.
+#[derive(Clone)]
+struct Region {
+    part: Part,
+    clusters: Range<usize>,
+    /// Groups of [`LANES`] of them.
+    groups: Range<usize>,
 }
 
 /// A [`Surface`] at rest on a body of one shape.
 #[derive(Clone)]
 pub struct ShapedSurface {
     surface: Arc<Surface>,
-    rest: Vec<Vec3A>,
-    /// Balls that hold the clusters at rest.
-    balls: Vec<(Vec3A, f32)>,
+    /// The points of each cluster.
+    rest: Vec<Group>,
+    /// Balls that hold the clusters at rest, group by group: middles and radii.
+    balls: Vec<(Group, Lanes)>,
     /// Radii of the balls that hold the parts in every pose.
     reach: Vec<f32>,
 }
@@ -78,8 +90,8 @@ impl Surface {
         let joints: Vec<Vec3> = mean.rest_bones().collect();
         let area = vertex_areas(model, &rest);
         let total: f32 = weights.iter().zip(&area).filter(|(w, _)| **w > 0.0).map(|(_, a)| a).sum();
-        let (points, clusters, bones, skin, ends, parts) = Default::default();
-        let mut surface = Self { model: model.clone(), points, clusters, bones, skin, ends, parts };
+        let (points, weights_of, skin, middles, spreads, regions) = Default::default();
+        let mut surface = Self { model: model.clone(), points, weights: weights_of, skin, middles, spreads, regions };
         for part in 0..=u8::MAX {
             let vertices: Vec<usize> = (0..rest.len()).filter(|&v| model.part()[v] == part && weights[v] > 0.0).collect();
             if vertices.is_empty() {
@@ -92,16 +104,19 @@ impl Surface {
                     spread(&vertices, ((share * n as f32).round() as usize).max(1), &rest, &weights)
                 }
             };
-            let first = surface.clusters.len();
+            let (first, group) = (surface.weights.len(), surface.middles.groups());
             surface.cluster(chosen, &rest);
-            surface.parts.push((Part::new(model, usize::from(part), &vertices, &rest, &joints), first..surface.clusters.len()));
+            let clusters = first..surface.weights.len();
+            clusters.clone().step_by(LANES).for_each(|c| surface.group(c..clusters.end.min(c + LANES)));
+            let part = Part::new(model, usize::from(part), &vertices, &rest, &joints);
+            surface.regions.push(Region { part, clusters, groups: group..surface.middles.groups() });
         }
         surface
     }
 
     /// How many points there are.
     pub fn len(&self) -> usize {
-        self.points.len()
+        self.points.iter().filter(|p| p.1 > 0.0).count()
     }
 
     /// Whether there is none.
@@ -111,55 +126,91 @@ impl Surface {
 
     /// The points on a body of this shape.
     pub fn shape(self: &Arc<Self>, body: &ShapedBody) -> ShapedSurface {
-        let rest: Vec<Vec3A> = self.points.iter().map(|&(v, _)| self.model.rest_vertex(v, body.betas()).into()).collect();
-        let slack = if self.model.extra.is_some() { CORRECTIVE } else { 0.0 };
-        let ball = |range: &Range<usize>| {
-            let points = &rest[range.clone()];
-            let centre = points.iter().sum::<Vec3A>() / points.len() as f32;
-            (centre, slack + points.iter().map(|p| p.distance(centre)).fold(0.0, f32::max))
-        };
-        let balls = self.clusters.iter().map(ball).collect();
+        let rest: Vec<Vec3> = self.points.iter().map(|&(v, _)| self.model.rest_vertex(v, body.betas())).collect();
+        let slack = ROUNDING + if self.model.extra.is_some() { CORRECTIVE } else { 0.0 };
         let joints: Vec<Vec3> = body.rest_bones().collect();
-        let radius = |(part, clusters): &(Part, Range<usize>)| {
-            let points = self.clusters[clusters.clone()].iter().flat_map(Range::clone).map(|i| (self.points[i].0, rest[i].into()));
-            slack + part.radius(&self.model, points, &joints)
+        let radius = |region: &Region| {
+            let points = region.clusters.start * LANES..region.clusters.end * LANES;
+            slack + region.part.radius(&self.model, points.map(|i| (self.points[i].0, rest[i])), &joints)
         };
-        let reach = self.parts.iter().map(radius).collect();
-        ShapedSurface { surface: self.clone(), rest, balls, reach }
+        let balls = self.regions.iter().flat_map(|region| balls(&region.clusters, &rest, slack)).collect();
+        let reach = self.regions.iter().map(radius).collect();
+        ShapedSurface { surface: self.clone(), rest: rest.chunks_exact(LANES).map(|p| grouped(|l| p[l])).collect(), balls, reach }
     }
 
     /// Cuts `points` in two along their longest side until each piece is a cluster.
     fn cluster(&mut self, mut points: Vec<(usize, f32)>, rest: &[Vec3]) {
-        if points.len() <= CLUSTER {
-            let first = self.points.len();
-            let mut bones: Vec<usize> = points.iter().flat_map(|p| self.model.skin.of(p.0)).filter(|e| e.1 > 0.0).map(|e| e.0).collect();
-            bones.sort_unstable();
-            bones.dedup();
-            for (vertex, weight) in points {
-                self.points.push((vertex, weight));
-                self.skin.extend(self.model.skin.of(vertex).iter().filter(|e| e.1 > 0.0).map(|&(k, w)| (k as u32, w)));
-                self.ends.push(self.skin.len());
-            }
-            self.clusters.push(first..self.points.len());
-            self.bones.push(bones);
+        if points.len() <= LANES {
+            points.resize(LANES, (points[points.len() - 1].0, 0.0));
+            let bones = self.bones(&points);
+            self.skin.push(bones.into_iter().map(|k| (k, Lanes(std::array::from_fn(|l| self.model.skin.weight(points[l].0, k))))));
+            self.weights.push(Lanes(std::array::from_fn(|l| points[l].1)));
+            self.points.extend(points);
             return;
         }
         let bounds = points.iter().map(|p| rest[p.0]).fold((Vec3::INFINITY, Vec3::NEG_INFINITY), |(a, b), p| (a.min(p), b.max(p)));
         let axis = (bounds.1 - bounds.0).max_position();
         points.sort_by(|a, b| rest[a.0][axis].total_cmp(&rest[b.0][axis]));
-        let upper = points.split_off(points.len() / 2);
+        let upper = points.split_off((points.len() / 2).next_multiple_of(LANES));
         self.cluster(points, rest);
         self.cluster(upper, rest);
     }
+
+    /// Bones that move any of `points`.
+    fn bones(&self, points: &[(usize, f32)]) -> Vec<usize> {
+        let mut bones: Vec<usize> = points.iter().flat_map(|p| self.model.skin.of(p.0)).filter(|e| e.1 > 0.0).map(|e| e.0).collect();
+        bones.sort_unstable();
+        bones.dedup();
+        bones
+    }
+
+    /// Takes [`LANES`] clusters or fewer together, so that their balls can be looked at together.
+    fn group(&mut self, clusters: Range<usize>) {
+        let points = |c: usize| &self.points[LANES * c..LANES * (c + 1)];
+        // Mean of a bone's weights in a cluster, and how far one of them is from it.
+        let sway = |c: usize, bone: usize| {
+            let weight = |p: &(usize, f32)| self.model.skin.weight(p.0, bone);
+            let mean = points(c).iter().map(weight).sum::<f32>() / LANES as f32;
+            (mean, points(c).iter().map(|p| (weight(p) - mean).abs()).fold(0.0, f32::max))
+        };
+        let bones = self.bones(&self.points[LANES * clusters.start..LANES * clusters.end]);
+        let sways: Vec<Vec<(f32, f32)>> = bones.iter().map(|&k| clusters.clone().map(|c| sway(c, k)).collect()).collect();
+        let total = |l: usize| sways.iter().map(|s| s[l].1).sum::<f32>();
+        let lanes = |of: &dyn Fn(usize) -> f32| Lanes(std::array::from_fn(|l| if l < clusters.len() { of(l) } else { 0.0 }));
+        let means: Vec<_> = bones.iter().zip(&sways).map(|(&k, s)| (k, lanes(&|l| s[l].0))).collect();
+        let spreads: Vec<_> = bones.iter().zip(&sways).map(|(&k, s)| (k, lanes(&|l| s[l].1 * total(l)))).collect();
+        self.middles.push(means);
+        self.spreads.push(spreads.into_iter().filter(|(_, w)| w.0.iter().any(|&w| w > 0.0)));
+    }
+}
+
+/// Middles and radii of the balls round these clusters of points at rest, group by group.
+fn balls(clusters: &Range<usize>, rest: &[Vec3], slack: f32) -> Vec<(Group, Lanes)> {
+    let ball = |c: usize| {
+        let points = &rest[LANES * c..LANES * (c + 1)];
+        let middle = points.iter().sum::<Vec3>() / LANES as f32;
+        (middle, slack + points.iter().map(|p| p.distance(middle)).fold(0.0, f32::max))
+    };
+    let balls: Vec<(Vec3, f32)> = clusters.clone().map(ball).collect();
+    let group = |balls: &[(Vec3, f32)]| {
+        let at = |l: usize| balls[l.min(balls.len() - 1)];
+        (grouped(|l| at(l).0), Lanes(std::array::from_fn(|l| at(l).1)))
+    };
+    balls.chunks(LANES).map(group).collect()
+}
+
+/// Sixteen points.
+fn grouped(point: impl Fn(usize) -> Vec3) -> Group {
+    [0, 1, 2].map(|axis| Lanes(std::array::from_fn(|l| point(l)[axis])))
 }
 
 /// What a body may be inside of; points are in the world, metres.
 pub trait Obstacles {
-    /// No more than the distance from `p` to the nearest point inside.
-    fn clear(&self, p: Vec3A) -> f32;
+    /// Distances of sixteen points to the nearest point inside; negative inside.
+    fn distances(&self, at: &Group, out: &mut Lanes);
 
-    /// How far inside `p` is; 0 outside.
-    fn depth(&self, p: Vec3A) -> f32;
+    /// By how much distances outside may be too great, metres.
+    fn slack(&self) -> f32;
 }
 
 /// A body's motion: T frames.
@@ -182,76 +233,95 @@ impl ShapedSurface {
     pub fn over(&self, motion: &Moving, obstacles: &impl Obstacles) -> Vec<Inside> {
         let joints: Vec<[Vec3; JOINTS]> = motion.joints.chunks_exact(3 * JOINTS).map(as_points).collect();
         let params: Vec<&[f32]> = motion.params.chunks_exact(PARAMS).collect();
+        let all: Vec<usize> = (0..self.reach.len()).collect();
         let (mut near, mut touched, mut bones) = (Vec::new(), Vec::new(), Vec::new());
         let mut out = Vec::with_capacity(params.len());
         for (joints, params) in joints.chunks(BLOCK).zip(params.chunks(BLOCK)) {
-            near.clear();
-            near.extend((0..self.reach.len()).filter(|&p| self.comes_near(p, joints, motion.to_world, obstacles)));
+            self.near(&all, joints, motion.to_world, obstacles, &mut near);
             for (joints, params) in joints.iter().zip(params) {
-                touched.clear();
-                touched
-                    .extend(near.iter().copied().filter(|&p| self.comes_near(p, std::slice::from_ref(joints), motion.to_world, obstacles)));
-                let mut inside = Inside::default();
-                if !touched.is_empty() {
+                self.near(&near, std::slice::from_ref(joints), motion.to_world, obstacles, &mut touched);
+                out.push(if touched.is_empty() {
+                    Inside::default()
+                } else {
                     let posed = motion.body.pose(params);
                     place(motion.body, &posed, motion.to_world, &mut bones);
-                    touched.iter().for_each(|&p| self.add_part(p, &posed, &bones, obstacles, &mut inside));
-                }
-                out.push(inside);
+                    self.inside(&touched, &posed, &bones, obstacles)
+                });
             }
         }
         out
     }
 
-    /// Whether any of part `p` may be inside in one of the frames with these joints.
-    fn comes_near(&self, p: usize, frames: &[[Vec3; JOINTS]], to_world: &Frame, obstacles: &impl Obstacles) -> bool {
-        let middle = |joints: &[Vec3; JOINTS]| self.surface.parts[p].0.middle(joints);
-        let first = middle(&frames[frames.len() / 2]);
-        let apart = frames.iter().map(|f| middle(f).distance(first)).fold(0.0, f32::max);
-        obstacles.clear(to_world.point(first).into()) <= self.reach[p] + apart
+    /// Those of `parts` of which any may be inside in one of the frames with these joints, into `out`.
+    fn near(&self, parts: &[usize], frames: &[[Vec3; JOINTS]], to_world: &Frame, obstacles: &impl Obstacles, out: &mut Vec<usize>) {
+        out.clear();
+        for parts in parts.chunks(LANES) {
+            let (mut at, mut reach, mut distances) = (Group::default(), [0.0; LANES], Lanes::default());
+            for (l, &p) in parts.iter().enumerate() {
+                let middle = |joints: &[Vec3; JOINTS]| self.surface.regions[p].part.middle(joints);
+                let first = middle(&frames[frames.len() / 2]);
+                reach[l] = self.reach[p] + frames.iter().map(|f| middle(f).distance(first)).fold(0.0, f32::max);
+                at.iter_mut().zip(to_world.point(first).to_array()).for_each(|(at, v)| at.0[l] = v);
+            }
+            obstacles.distances(&at, &mut distances);
+            let may = |l: &usize| distances.0[*l] - obstacles.slack() <= reach[*l];
+            out.extend((0..parts.len()).filter(may).map(|l| parts[l]));
+        }
     }
 
-    /// Adds what is inside of part `p`.
+    /// What is inside of these parts.
     ///
-    /// A bone takes a cluster's ball to a ball of the same size, and a skinned point lies between where its bones take it: so all points
-    /// of a cluster lie in the ball round the middle of those.
-    fn add_part(&self, p: usize, posed: &Posed, bones: &[Affine3A], obstacles: &impl Obstacles, sum: &mut Inside) {
-        for c in self.surface.parts[p].1.clone() {
-            let (used, (centre, radius)) = (&self.surface.bones[c], &self.balls[c]);
-            let at = |k: &usize| bones[*k].transform_point3a(*centre);
-            let middle = used.iter().map(at).sum::<Vec3A>() / used.len() as f32;
-            let apart = used.iter().map(|k| at(k).distance_squared(middle)).fold(0.0, f32::max).sqrt();
-            if obstacles.clear(middle) > radius + apart {
-                continue;
-            }
-            for i in self.surface.clusters[c].clone() {
-                let depth = obstacles.depth(self.skin(i, posed, bones));
-                if depth > 0.0 {
-                    let weight = self.surface.points[i].1;
-                    sum.count += weight;
-                    sum.depth += weight * depth;
+    /// A bone k takes a cluster's ball to a ball of the same size round m_k. A point whose bones weigh w_k lies within that size of the sum
+    /// of w_k m_k. From the middle m, the sum of W_k m_k with mean weights W_k, that is the sum of (w_k - W_k) (m_k - m) away: with
+    /// d_k >= |w_k - W_k| at most the root of (sum of d_k) (sum of d_k |m_k - m|^2).
+    fn inside(&self, parts: &[usize], posed: &Posed, bones: &[Bone], obstacles: &impl Obstacles) -> Inside {
+        let (mut count, mut depth) = (Lanes::default(), Lanes::default());
+        let (mut at, mut apart, mut distances) = (Group::default(), Lanes::default(), Lanes::default());
+        for region in parts.iter().map(|&p| &self.surface.regions[p]) {
+            for (group, first) in region.groups.clone().zip(region.clusters.clone().step_by(LANES)) {
+                let (middles, radii) = &self.balls[group];
+                self.surface.middles.skin(group, bones, middles, &mut at);
+                self.surface.spreads.spread(group, bones, middles, &at, &mut apart);
+                obstacles.distances(&at, &mut distances);
+                for l in 0..LANES.min(region.clusters.end - first) {
+                    if distances.0[l] - obstacles.slack() > radii.0[l] + apart.0[l] {
+                        continue;
+                    }
+                    let (mut points, mut own) = (Group::default(), Lanes::default());
+                    self.skin(first + l, posed, bones, &mut points);
+                    obstacles.distances(&points, &mut own);
+                    let sums = count.0.iter_mut().zip(&mut depth.0);
+                    for ((count, depth), (d, weight)) in sums.zip(own.0.iter().zip(&self.surface.weights[first + l].0)) {
+                        *count += if *d < 0.0 { *weight } else { 0.0 };
+                        *depth -= weight * d.min(0.0);
+                    }
                 }
             }
         }
+        Inside { count: count.0.iter().sum(), depth: depth.0.iter().sum() }
     }
 
-    /// Point `i` in the world.
-    fn skin(&self, i: usize, posed: &Posed, bones: &[Affine3A]) -> Vec3A {
-        let (surface, mut v) = (&*self.surface, self.rest[i]);
-        if let Some(extra) = &surface.model.extra {
-            let (n, vertex) = (extra.columns(), surface.points[i].0);
-            v += Vec3A::from(correct(&extra.correctives[vertex * n..(vertex + 1) * n], &posed.extra.feature));
+    /// The points of cluster `c` in the world.
+    fn skin(&self, c: usize, posed: &Posed, bones: &[Bone], out: &mut Group) {
+        let surface = &*self.surface;
+        let Some(extra) = &surface.model.extra else {
+            return surface.skin.skin(c, bones, &self.rest[c], out);
+        };
+        let (n, mut rest) = (extra.columns(), self.rest[c]);
+        for (l, &(vertex, _)) in surface.points[LANES * c..LANES * (c + 1)].iter().enumerate() {
+            let lift = correct(&extra.correctives[vertex * n..(vertex + 1) * n], &posed.extra.feature);
+            rest.iter_mut().zip(lift.to_array()).for_each(|(rest, v)| rest.0[l] += v);
         }
-        let own = &surface.skin[if i == 0 { 0 } else { surface.ends[i - 1] }..surface.ends[i]];
-        own.iter().fold(Vec3A::ZERO, |sum, &(k, w)| sum + w * bones[k as usize].transform_point3a(v))
+        surface.skin.skin(c, bones, &rest, out);
     }
 }
 
 /// What the bones of a posed body, joints first, do to points at rest, into `out`.
-fn place(body: &ShapedBody, posed: &Posed, to_world: &Frame, out: &mut Vec<Affine3A>) {
+fn place(body: &ShapedBody, posed: &Posed, to_world: &Frame, out: &mut Vec<Bone>) {
     let to_world = Affine3A::from_mat3_translation(to_world.rot, to_world.transl);
+    let moves = posed.bones().zip(body.rest_bones()).map(|((rot, pos), j)| to_world * Affine3A::from_mat3_translation(rot, pos - rot * j));
     out.clear();
-    out.extend(posed.bones().zip(body.rest_bones()).map(|((rot, pos), j)| to_world * Affine3A::from_mat3_translation(rot, pos - rot * j)));
+    out.extend(moves.map(|m| [0, 1, 2].map(|row| m.matrix3.row(row).extend(m.translation[row]).to_array())));
 }
 
 /// One frame of joints.

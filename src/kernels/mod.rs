@@ -1,15 +1,16 @@
-//! Fast f32 inference on the processor, for the frozen networks and for acting.
+//! Fast f32 loops on the processor: inference, for the frozen networks and for acting, and points of bodies among obstacles.
 //!
 //! A product runs over weights packed once into column panels; bias, activation and residual are applied while a tile is
 //! in the first-level cache. Every element is one chain of fused multiply-adds over the inputs in their order, so a row's
 //! result is the same bits on every instruction set, in every batch and on any number of threads.
-//! Training uses general products instead (`product`). This is the only module with `unsafe`: in `simd`, `product` and `memory`.
+//! Training uses general products instead (`product`). This is the only module with `unsafe`: in `simd`, `points`, `product` and `memory`.
 
 mod engine;
 mod gru;
 mod linear;
 mod memory;
 mod motion;
+mod points;
 mod policy;
 mod pool;
 mod product;
@@ -20,5 +21,6 @@ pub use gru::GruCell;
 pub use linear::{Activation, Linear, Source, View, ViewMut};
 pub use memory::keep_memory;
 pub use motion::{Decoder, Regressor};
+pub use points::{Bone, Group, LANES, Lanes, Probe, Pulls};
 pub use policy::PolicyEngine;
 pub use product::{Mat, product};

@@ -72,6 +72,7 @@ macro_rules! multiversion {
         }
     };
 }
+pub(super) use multiversion;
 
 multiversion! {
     /// Adds `bias` to the rows of a tile and applies the activation.

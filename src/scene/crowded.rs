@@ -1,8 +1,6 @@
 //! Crowded scenes: many rooms, procedural or from bundles, each with what walking and penetration need, made or read once and kept.
 
-use super::{
-    Depths, Navigator, Pair, PairOptions, Probe, Room, RoomKind, Rooms, Scene, SceneBundle, SdfGrid, SdfOptions, Setting, Split, TriMesh,
-};
+use super::{Navigator, Pair, PairOptions, Room, RoomKind, Rooms, Scene, SceneBundle, SdfGrid, SdfOptions, Setting, Split, TriMesh};
 use crate::rng::{Stream, stream};
 use crate::{Error, Result};
 use rand::RngExt;
@@ -72,7 +70,6 @@ pub struct CrowdedScene {
     /// None where it is not known.
     pub mesh: Option<Arc<TriMesh>>,
     pub sdf: Arc<SdfGrid>,
-    depths: Depths,
     pub pairs: Vec<Pair>,
 }
 
@@ -126,8 +123,8 @@ impl CrowdedScene {
         let pairs = pairs.draw(&Navigator::new(&room.walkable, pairs.clearance.into())?, seed)?;
         let layout = SdfOptions { voxel, top: Some(REACH), ..SdfOptions::for_floor(&room.walkable, 0.0)? };
         let sdf = SdfGrid::build(&room.mesh, &layout)?;
-        let (depths, scene) = (Depths::new(&sdf), Scene { walkable: room.walkable, obstacles: Vec::new() });
-        Ok(Self { name: room.name, scene, mesh: Some(Arc::new(room.mesh)), sdf: Arc::new(sdf), depths, pairs })
+        let scene = Scene { walkable: room.walkable, obstacles: Vec::new() };
+        Ok(Self { name: room.name, scene, mesh: Some(Arc::new(room.mesh)), sdf: Arc::new(sdf), pairs })
     }
 
     /// The scene of the bundle in the folder `dir`, with its floor at z = 0. Pairs without a way are left out.
@@ -142,13 +139,8 @@ impl CrowdedScene {
             return Err(lack("pairs with a way from start to goal", "--pairs-count"));
         }
         let sdf = sdf.ok_or_else(|| lack("signed distances", "--voxel 0.05"))?;
-        let (depths, scene) = (Depths::new(&sdf), Scene { walkable, obstacles: Vec::new() });
-        Ok(Self { name, scene, mesh: mesh.map(Arc::new), sdf: Arc::new(sdf), depths, pairs })
-    }
-
-    /// Look-ups of its distances.
-    pub fn probe(&self) -> Probe<'_> {
-        self.depths.probe(&self.sdf)
+        let scene = Scene { walkable, obstacles: Vec::new() };
+        Ok(Self { name, scene, mesh: mesh.map(Arc::new), sdf: Arc::new(sdf), pairs })
     }
 
     /// One of the pairs.

@@ -2,7 +2,6 @@
 
 mod bundle;
 mod crowded;
-mod depths;
 #[cfg(test)]
 mod furniture;
 #[cfg(test)]
@@ -22,7 +21,6 @@ mod walkable;
 
 pub use bundle::{PICTURE, SceneBundle};
 pub use crowded::{BundleFolders, CrowdedScene, CrowdedScenes};
-pub use depths::{Depths, Probe};
 pub use grid::Grid;
 pub use make::{MakeOptions, SceneFiles, Stages};
 pub use mesh::{Material, MeshOptions, TriMesh, Up, read_mesh};

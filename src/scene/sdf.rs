@@ -11,6 +11,7 @@ mod tree;
 pub use build::SdfOptions;
 pub use solid::Solid;
 
+use crate::kernels::Probe;
 use crate::{Error, Result};
 use glam::{UVec3, Vec3};
 
@@ -86,6 +87,14 @@ impl SdfGrid {
             _ if distance < 0.0 => distance + beyond,
             _ => distance.hypot(beyond),
         }
+    }
+
+    /// Many look-ups at once, which give what [`SdfGrid::at`] does but for rounding.
+    ///
+    /// # Panics
+    /// When [`SdfGrid::check`] would refuse the sizes.
+    pub fn probe(&self) -> Probe<'_> {
+        Probe::new(&self.values, self.lowest.to_array(), self.voxel, self.dims)
     }
 
     /// Trilinear interpolation at `steps` voxels from the lowest centre, which must lie within the grid.

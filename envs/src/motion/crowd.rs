@@ -2,12 +2,12 @@
 
 use super::MotionTask;
 use egogen::body::{BETAS, BodyModel, Frame, Inside, JOINTS, Moving, Obstacles, PARAMS, Points, ShapedBody, ShapedSurface, Surface};
+use egogen::kernels::{Group, Lanes, Probe};
 use egogen::motion::{FRAMES, SEED};
 use egogen::rng::Stream;
-use egogen::scene::{CrowdedScene, Probe, Setting, Split};
+use egogen::scene::{CrowdedScene, SdfGrid, Setting, Split};
 use egogen::sim::{People, Primitives, Sim};
 use egogen::{Error, Result};
-use glam::Vec3A;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -143,7 +143,7 @@ impl Crowd {
         };
         let own = |all: &'a [f32], width: usize| &all[i * frames * width..(i + 1) * frames * width];
         let motion = Moving { body, params: own(params, PARAMS), joints: own(joints, 3 * JOINTS), to_world: &to_world[i] };
-        let obstacles = Room::new(scene);
+        let obstacles = Room::new(&scene.sdf);
         Presence::over(&surface.over(&motion, &obstacles))
     }
 }
@@ -156,19 +156,18 @@ struct Room<'a> {
 }
 
 impl<'a> Room<'a> {
-    fn new(scene: &'a CrowdedScene) -> Self {
-        Self { probe: scene.probe(), slack: SLACK * scene.sdf.voxel }
+    fn new(sdf: &'a SdfGrid) -> Self {
+        Self { probe: sdf.probe(), slack: SLACK * sdf.voxel }
     }
 }
 
 impl Obstacles for Room<'_> {
-    fn clear(&self, p: Vec3A) -> f32 {
-        self.probe.distance(p) - self.slack
+    fn distances(&self, at: &Group, out: &mut Lanes) {
+        self.probe.distances(at, out);
     }
 
-    #[inline]
-    fn depth(&self, p: Vec3A) -> f32 {
-        self.probe.depth(p)
+    fn slack(&self) -> f32 {
+        self.slack
     }
 }
 

@@ -37,13 +37,17 @@ fn weights_make_the_vertices_of_smplx() {
 struct Exact<F>(F);
 
 impl<F: Fn(Vec3) -> f32> Obstacles for Exact<F> {
-    fn clear(&self, p: Vec3A) -> f32 {
-        self.0(p.into())
+    fn distances(&self, at: &Group, out: &mut Lanes) {
+        out.0 = std::array::from_fn(|l| self.0(point(at, l)));
     }
 
-    fn depth(&self, p: Vec3A) -> f32 {
-        -self.0(p.into()).min(0.0)
+    fn slack(&self) -> f32 {
+        0.0
     }
+}
+
+fn point(group: &Group, l: usize) -> Vec3 {
+    Vec3::from(group.map(|axis| axis.0[l]))
 }
 
 /// One frame.
@@ -75,24 +79,35 @@ fn passing_over_parts_and_clusters_changes_nothing() {
 }
 
 #[test]
-fn a_part_stays_within_its_ball() {
+fn parts_and_clusters_stay_within_their_balls() {
     let model = BodyModel::embedded();
     let surface = Arc::new(Surface::new(&model, Points::All));
+    let (mut sizes, mut count) = (0.0, 0.0);
     for k in 0..60u64 {
         let body = model.shape(&[0.5 * ((k % 5) as f32 - 2.0); BETAS]);
         let (shaped, posed) = (surface.shape(&body), body.pose(&random_params(k)));
         let mut bones = Vec::new();
         place(&body, &posed, &Frame::IDENTITY, &mut bones);
-        for ((part, clusters), reach) in surface.parts.iter().zip(&shaped.reach) {
-            let middle = part.middle(&posed.pos);
-            for i in surface.clusters[clusters.clone()].iter().flat_map(Range::clone) {
-                let far = shaped.skin(i, &posed, &bones).distance(middle.into());
-                assert!(far <= reach + 1e-4, "a point {far} m from the middle of a ball of {reach} m");
+        for (region, reach) in surface.regions.iter().zip(&shaped.reach) {
+            let (mut at, mut apart, mut points) = (Group::default(), Lanes::default(), Group::default());
+            for (n, c) in region.clusters.clone().enumerate() {
+                let (group, l) = (region.groups.start + n / LANES, n % LANES);
+                let (middles, radii) = &shaped.balls[group];
+                surface.middles.skin(group, &bones, middles, &mut at);
+                surface.spreads.spread(group, &bones, middles, &at, &mut apart);
+                shaped.skin(c, &posed, &bones, &mut points);
+                let (ball, part) = (radii.0[l] + apart.0[l], region.part.middle(&posed.pos));
+                (sizes, count) = (sizes + ball, count + 1.0);
+                for p in (0..LANES).map(|l| point(&points, l)) {
+                    assert!(p.distance(part) <= reach + 1e-4, "a point {} m from the middle of a ball of {reach} m", p.distance(part));
+                    let far = p.distance(point(&at, l));
+                    assert!(far <= ball, "a point {far} m from the middle of a cluster's ball of {ball} m");
+                }
             }
         }
     }
     let widest = surface.shape(&model.shape(&[0.0; BETAS])).reach.iter().copied().fold(0.0, f32::max);
-    assert!(widest < 0.45, "balls of up to {widest} m leave out little");
+    assert!(widest < 0.45 && sizes / count < 0.05, "balls of up to {widest} m, and on average of {} m, leave out little", sizes / count);
 }
 
 #[test]

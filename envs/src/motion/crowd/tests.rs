@@ -4,7 +4,7 @@ use super::*;
 use crate::motion::{MotionEnv, Weights};
 use crate::{StepResult, VecEnv};
 use egogen::rng::stream;
-use egogen::scene::{CrowdedScenes, Depths, PairOptions, SdfGrid, SdfOptions, TriMesh};
+use egogen::scene::{CrowdedScenes, PairOptions, SdfGrid, SdfOptions, TriMesh};
 use egogen::sim::World;
 use glam::{Mat3, Vec3};
 use rand_distr::{Distribution, StandardNormal};
@@ -79,12 +79,12 @@ fn few_points_judge_like_the_whole_mesh() {
 struct Everywhere<'a>(Probe<'a>);
 
 impl Obstacles for Everywhere<'_> {
-    fn clear(&self, _: Vec3A) -> f32 {
-        f32::NEG_INFINITY
+    fn distances(&self, at: &Group, out: &mut Lanes) {
+        self.0.distances(at, out);
     }
 
-    fn depth(&self, p: Vec3A) -> f32 {
-        self.0.depth(p)
+    fn slack(&self) -> f32 {
+        f32::INFINITY
     }
 }
 
@@ -103,9 +103,9 @@ fn passing_over_what_is_clear_of_a_room_changes_nothing() {
                 joints: &prims.joints[i * FRAMES * 3 * JOINTS..][..FRAMES * 3 * JOINTS],
                 to_world: &prims.frames[i],
             };
-            let room = Room::new(scene);
+            let room = Room::new(&scene.sdf);
             let got = crowd.shapes[i].surface.over(&motion, &room);
-            assert_eq!(got, crowd.shapes[i].surface.over(&motion, &Everywhere(scene.probe())));
+            assert_eq!(got, crowd.shapes[i].surface.over(&motion, &Everywhere(scene.sdf.probe())));
             inside += got.iter().filter(|f| f.count > 0.0).count();
         }
     }
@@ -137,12 +137,11 @@ fn inside(boxes: &[Block], params: &[f32], to_world: &Frame, voxel: f32) -> Vec<
     let (object, material) = (mesh.add_object("box"), mesh.add_material("grey", [0.5, 0.5, 0.5, 1.0]));
     boxes.iter().for_each(|b| mesh.add_box(object, material, b.centre, b.size, b.yaw));
     let sdf = SdfGrid::build(&mesh, &SdfOptions { voxel, ..Default::default() }).unwrap();
-    let depths = Depths::new(&sdf);
     let model = BodyModel::embedded();
     let Shaped { body, surface } = Shaped::new(&model, &Arc::new(Surface::new(&model, Points::All)), &[0.0; BETAS]);
     let joints: Vec<f32> = params.chunks_exact(PARAMS).flat_map(|p| body.pose(p).pos).flat_map(|p| p.to_array()).collect();
     let motion = Moving { body: &body, params, joints: &joints, to_world };
-    surface.over(&motion, &Room { probe: depths.probe(&sdf), slack: SLACK * voxel })
+    surface.over(&motion, &Room::new(&sdf))
 }
 
 #[test]

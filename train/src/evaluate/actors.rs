@@ -1,6 +1,6 @@
 //! Who chooses the latents.
 
-use super::way::Way;
+use super::way::{Way, Ways};
 use crate::acts::normal_rows;
 use crate::{Compute, Error, Policy, Result};
 use egogen::agent::ObsGroup;
@@ -12,6 +12,7 @@ use egogen::sim::{People, Primitives};
 use egogen_envs::VecEnv;
 use egogen_envs::motion::{MotionEnv, blocked};
 use glam::{Vec2, Vec3};
+use std::sync::{Arc, Mutex, PoisonError};
 
 /// Stream of all noise in evaluation.
 const NOISE: &str = "evaluation noise";
@@ -96,11 +97,13 @@ pub struct Greedy {
     pub candidates: usize,
     /// People searched for at once, which bounds the memory.
     pub at_once: usize,
+    /// Ways over the floor that each person walked on last.
+    ways: Mutex<Vec<Arc<Ways>>>,
 }
 
 impl Default for Greedy {
     fn default() -> Self {
-        Self { candidates: 64, at_once: 16 }
+        Self { candidates: 64, at_once: 16, ways: Mutex::default() }
     }
 }
 
@@ -109,6 +112,7 @@ impl Greedy {
         let (n, dim) = (env.people().len(), env.sim().model().latent_dim());
         let mut chosen = vec![0.0; n * dim];
         let mut prims = Primitives::default();
+        let ways = self.ways(env);
         let who: Vec<usize> = (0..n).filter(|&i| playing[i]).collect();
         for group in who.chunks(self.at_once) {
             let rows: Vec<usize> = group.iter().flat_map(|&i| std::iter::repeat_n(i, self.candidates)).collect();
@@ -118,7 +122,7 @@ impl Greedy {
             env.sim().step(&mut people, &latents, &mut prims)?;
             for (g, &i) in group.iter().enumerate() {
                 let setting = env.setting(i);
-                let way = Way::plan(&setting.scene.walkable, Stance::of(env.people(), i).at, setting.goal);
+                let way = ways[i].plan(Stance::of(env.people(), i).at, setting.goal);
                 let ground = env.ground(i);
                 let costs: Vec<f32> =
                     (0..self.candidates).map(|k| cost(env, (&way, &ground, setting.goal), &people, g * self.candidates + k)).collect();
@@ -128,6 +132,19 @@ impl Greedy {
             }
         }
         Ok(chosen)
+    }
+
+    /// Ways over each person's floor: those of the last step, where that is the same, and one for all people of a scene.
+    fn ways(&self, env: &MotionEnv) -> Vec<Arc<Ways>> {
+        let mut kept = self.ways.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut out: Vec<Arc<Ways>> = Vec::with_capacity(env.people().len());
+        for i in 0..env.people().len() {
+            let floor = &env.setting(i).scene.walkable;
+            let known = kept.get(i).into_iter().chain(out.iter().rev()).find(|ways| ways.floor() == floor).cloned();
+            out.push(known.unwrap_or_else(|| Arc::new(Ways::over(floor))));
+        }
+        kept.clone_from(&out);
+        out
     }
 }
 

@@ -1,6 +1,6 @@
 //! What the motion of an episode tells: the goal, the way, obstacles and other people.
 
-use super::way::Way;
+use super::way::Ways;
 use super::{Film, Played, Setup, Solids};
 use egogen::body::{BodyModel, MARKER_DIM, PARAMS, ShapedBody, joint, smplx_weights};
 use egogen::metrics::{
@@ -108,7 +108,7 @@ fn alone(setup: &Setup, i: usize, track: &Track) -> Measured {
     let mut markers = vec![0.0; track.len() * MARKER_DIM];
     track.shaped.markers_batch(&film.frames, &mut markers);
     let near = least_distance(&path, goal) < NEAR;
-    let shortest = Way::plan(walkable, path[0], goal).length();
+    let shortest = Ways::over(walkable).plan(path[0], goal).length();
     let [obstacle_frames, obstacle_depth, most_inside] = obstacles(setup, i, track, &path);
     let middle = film.setting.scene.obstacles.first().map(|b| b.centre);
     Measured {

@@ -2,11 +2,40 @@
 
 use egogen::scene::{Navigator, Polygon};
 use glam::Vec2;
+use std::sync::OnceLock;
 
 /// Distances to keep from borders, metres: the first that leaves a way.
 const CLEARANCES: [f64; 4] = [0.4, 0.3, 0.2, 0.1];
 /// How far ahead on its way a walker turns to, metres.
 const AHEAD: f32 = 0.5;
+
+/// Ways over one floor. What they share is found once.
+pub struct Ways {
+    floor: Polygon,
+    /// Of each clearance; None where nobody can walk with it.
+    navigators: [OnceLock<Option<Navigator>>; CLEARANCES.len()],
+}
+
+impl Ways {
+    /// Ways over `floor`.
+    pub fn over(floor: &Polygon) -> Self {
+        Self { floor: floor.clone(), navigators: Default::default() }
+    }
+
+    /// Where they lead.
+    pub fn floor(&self) -> &Polygon {
+        &self.floor
+    }
+
+    /// The shortest way from `start` to `goal`, as far from borders as can be; the straight line where there is none.
+    pub fn plan(&self, start: Vec2, goal: Vec2) -> Way {
+        let route = |(clearance, kept): (f64, &OnceLock<Option<Navigator>>)| {
+            kept.get_or_init(|| Navigator::new(&self.floor, clearance).ok()).as_ref()?.route(start.as_dvec2(), goal.as_dvec2())
+        };
+        let found = CLEARANCES.into_iter().zip(&self.navigators).find_map(route);
+        Way { points: found.map_or_else(|| vec![start, goal], |r| r.points.iter().map(|p| p.as_vec2()).collect()) }
+    }
+}
 
 /// A way to the goal.
 #[derive(Clone, Debug, PartialEq)]
@@ -16,13 +45,6 @@ pub struct Way {
 }
 
 impl Way {
-    /// The shortest way from `start` to `goal` over `floor`, as far from its borders as can be; the straight line where there is none.
-    pub fn plan(floor: &Polygon, start: Vec2, goal: Vec2) -> Self {
-        let route = |clearance: &f64| Navigator::new(floor, *clearance).ok()?.route(start.as_dvec2(), goal.as_dvec2());
-        let points = CLEARANCES.iter().find_map(route).map(|r| r.points.iter().map(|p| p.as_vec2()).collect());
-        Self { points: points.unwrap_or_else(|| vec![start, goal]) }
-    }
-
     /// Length of the way, metres.
     pub fn length(&self) -> f32 {
         self.points.windows(2).map(|s| s[0].distance(s[1])).sum()
@@ -82,10 +104,17 @@ mod tests {
         let square = |h: f64| [(-h, -h), (h, -h), (h, h), (-h, h)].map(DVec2::from).to_vec();
         let floor = Polygon::new(square(4.0), vec![square(0.5)]).unwrap();
         let (start, goal) = (Vec2::new(-2.0, 0.1), Vec2::new(2.0, 0.1));
-        let way = Way::plan(&floor, start, goal);
+        let ways = Ways::over(&floor);
+        let way = ways.plan(start, goal);
         let highest = way.points.iter().map(|p| p.y).fold(0.0, f32::max);
         assert!(way.points.len() > 2 && highest > 0.89 && highest < 1.0, "{way:?}");
         // From within the box there is no way but the straight one.
-        assert_eq!(Way::plan(&floor, Vec2::ZERO, goal).points, [Vec2::ZERO, goal]);
+        assert_eq!(ways.plan(Vec2::ZERO, goal).points, [Vec2::ZERO, goal]);
+        // Where there is less room: 0.35 m beside the box need the second clearance. What was asked before makes no difference.
+        let close = ways.plan(Vec2::new(0.0, -0.85), goal);
+        assert_eq!(close, Ways::over(&floor).plan(Vec2::new(0.0, -0.85), goal));
+        let lowest = close.points[1..].iter().map(|p| p.y).fold(0.0, f32::min);
+        assert!(close.points.len() > 2 && lowest < -0.79 && lowest > -0.83, "{close:?}");
+        assert_eq!(ways.plan(start, goal), way);
     }
 }

@@ -3,9 +3,9 @@
 use crate::scene::{BoxObstacle, Polygon, Solid};
 use glam::Vec3;
 
-/// Width of the step of [`occupancy`], metres.
+/// Width of the step of an occupancy, metres.
 const SOFT: f32 = 0.01;
-/// Beyond this from a surface an occupancy is below 0.0001, metres.
+/// Beyond this from a surface an occupancy is less than 0.0001 from 0 or 1, which it counts as, metres.
 const AWAY: f32 = 10.0 * SOFT;
 
 /// Whether the floor projection of any vertex lies off the walkable area: in an obstacle's outline or beyond the walls.
@@ -25,16 +25,37 @@ pub fn box_distance(b: &BoxObstacle, p: Vec3) -> f32 {
     out.max(Vec3::ZERO).length() + out.max_element().min(0.0)
 }
 
-/// Number of vertices inside another's body: those at which the winding number of its mesh is above a half.
-pub fn vertices_inside(vertices: &[Vec3], other: &Solid) -> usize {
-    near(vertices, other, 0.0).filter(|&v| other.contains(v)).count()
+/// How much of a body lies in another's.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Overlap {
+    /// Number of vertices inside: those at which the winding number of the other's mesh is above a half.
+    pub vertices: usize,
+    /// Mean over the vertices of 1 / (1 + exp(d / 1 cm)), d the signed distance to the other's surface (negative inside): 0 for bodies
+    /// apart, and for one vertex 0.5 on the other's surface. Smooth in [0, 1], as learned occupancy fields are.
+    pub occupancy: f32,
 }
 
-/// Mean over the vertices of 1 / (1 + exp(d / 1 cm)), d the signed distance to another's body (negative inside): 0 for bodies apart, and
-/// for one vertex 0.5 on the other's surface. Smooth in [0, 1], as learned occupancy fields are.
-pub fn occupancy(vertices: &[Vec3], other: &Solid) -> f32 {
-    let soft = |v: Vec3| 1.0 / (1.0 + (other.distance(v) / SOFT).exp());
-    near(vertices, other, AWAY).map(soft).sum::<f32>() / vertices.len().max(1) as f32
+/// How much of the body of these vertices lies in `other`.
+///
+/// Whether a vertex is inside is not asked for where one before it is, and no surface lies between them: it is nearer to that one than any
+/// triangle.
+pub fn overlap(vertices: &[Vec3], other: &Solid) -> Overlap {
+    let (mut inside, mut sum) = (0, 0.0);
+    let (mut last, mut clear, mut within) = (Vec3::ZERO, 0.0, false);
+    for v in near(vertices, other, AWAY) {
+        let distance = other.surface_distance(v, AWAY);
+        if last.distance(v) >= clear {
+            within = other.contains(v);
+        }
+        (last, clear) = (v, distance);
+        inside += usize::from(within);
+        sum += match (distance < AWAY, within) {
+            (true, true) => 1.0 / (1.0 + (-distance / SOFT).exp()),
+            (true, false) => 1.0 / (1.0 + (distance / SOFT).exp()),
+            (false, within) => f32::from(within),
+        };
+    }
+    Overlap { vertices: inside, occupancy: sum / vertices.len().max(1) as f32 }
 }
 
 /// Vertices within `margin` of the bounds of `other`.
@@ -87,12 +108,13 @@ mod tests {
     fn points_in_a_cube_by_hand() {
         let solid = cube(0.5);
         let points = [Vec3::ZERO, Vec3::new(0.45, 0.45, -0.45), Vec3::new(0.55, 0.0, 0.0), Vec3::new(3.0, 0.0, 0.0)];
-        assert_eq!(vertices_inside(&points, &solid), 2);
+        let got = overlap(&points, &solid);
+        assert_eq!(got.vertices, 2);
         assert!((solid.distance(points[1]) + 0.05).abs() < 1e-6 && (solid.distance(points[2]) - 0.05).abs() < 1e-6);
         // 5 cm are five widths: 1 / (1 + e^-5) and 1 / (1 + e^5); deep inside 1; beyond 10 cm nothing.
         let want = (1.0 + 0.993_307 + 0.006_693) / 4.0;
-        assert!((occupancy(&points, &solid) - want).abs() < 1e-5, "{}", occupancy(&points, &solid));
-        assert!((occupancy(&[Vec3::new(0.5, 0.1, 0.1)], &solid) - 0.5).abs() < 1e-4);
+        assert!((got.occupancy - want).abs() < 1e-5, "{got:?}");
+        assert!((overlap(&[Vec3::new(0.5, 0.1, 0.1)], &solid).occupancy - 0.5).abs() < 1e-4);
     }
 
     /// Counts and distances by Open3D and trimesh: tests/tools/bodies/make.py.
@@ -113,10 +135,16 @@ mod tests {
         for (i, case) in cases.iter().enumerate() {
             let (a, b) = (skin(&case["a"]), skin(&case["b"]));
             let solid = Solid::new(&b, model.faces()).unwrap();
-            let inside = vertices_inside(&a, &solid);
+            let got = overlap(&a, &solid);
+            let inside = got.vertices;
             let want = case["inside"].as_u64().unwrap() as usize;
             // Vertices within rounding of the surface may go either way.
             assert!(inside.abs_diff(want) <= 1 + want / 500, "case {i}: {inside}, expected {want}");
+            // Vertex by vertex, at any distance.
+            let distances: Vec<f32> = a.iter().map(|&v| solid.distance(v)).collect();
+            assert_eq!(inside, distances.iter().filter(|d| **d < 0.0).count(), "case {i}");
+            let occupancy = distances.iter().map(|d| 1.0 / (1.0 + (d / SOFT).exp())).sum::<f32>() / a.len() as f32;
+            assert!((got.occupancy - occupancy).abs() < 2e-5, "case {i}: {}, expected {occupancy}", got.occupancy);
             for p in case["points"].as_array().unwrap() {
                 let p = numbers(p);
                 let d = solid.distance(Vec3::new(p[0], p[1], p[2]));

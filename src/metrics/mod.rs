@@ -11,7 +11,7 @@ mod smoothness;
 mod ways;
 
 pub use collapse::{Collapse, collapse};
-pub use contact::{box_distance, deepest, meets_outline, occupancy, vertices_inside};
+pub use contact::{Overlap, box_distance, deepest, meets_outline, overlap};
 pub use diversity::average_pairwise_distance;
 pub use feet::{contact_score, floor_penetration, foot_heights, foot_speeds, stance_moves, stance_slide, stance_slides};
 pub use prior::{kl_mean_only, kl_to_standard};

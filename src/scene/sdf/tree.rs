@@ -20,7 +20,7 @@ impl Boundable for Tri {
     }
 }
 
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 struct Node {
     low: Vec3,
     high: Vec3,
@@ -47,6 +47,8 @@ impl Node {
 pub(super) struct Tree {
     /// In the order of the leaves.
     triangles: Vec<Tri>,
+    /// Which of the triangles that it was made from each of these is.
+    order: Vec<u32>,
     nodes: Vec<Node>,
 }
 
@@ -55,17 +57,21 @@ impl Tree {
     pub fn new(triangles: Vec<Tri>) -> Self {
         let params = if triangles.len() < MANY { BvhBuildParams::medium_build() } else { BvhBuildParams::fast_build() };
         let bvh = build_bvh2(&triangles, params, &mut Default::default());
-        let node = |n: &obvhs::bvh2::node::Bvh2Node| {
-            let (low, high) = (n.aabb().min.into(), n.aabb().max.into());
-            Node { low, high, first: n.first_index, count: n.prim_count, area: Vec3::ZERO, middle: Vec3::ZERO, far: 0.0 }
-        };
-        let nodes = bvh.nodes.iter().map(node).collect();
-        let mut tree = Self { triangles: bvh.primitive_indices.iter().map(|&i| triangles[i as usize]).collect(), nodes };
-        tree.sum_up();
+        let node = |n: &obvhs::bvh2::node::Bvh2Node| Node { first: n.first_index, count: n.prim_count, ..Node::default() };
+        let mut tree = Self { triangles: Vec::new(), order: bvh.primitive_indices, nodes: bvh.nodes.iter().map(node).collect() };
+        tree.fit(&triangles);
         tree
     }
 
-    /// Areas and middles of all nodes, children before their parents.
+    /// Makes it the tree of triangles that have moved, as many and in the same order as those it was made from. Questions are as fast as
+    /// before where neighbours stay neighbours.
+    pub fn fit(&mut self, triangles: &[Tri]) {
+        self.triangles.clear();
+        self.triangles.extend(self.order.iter().map(|&i| triangles[i as usize]));
+        self.sum_up();
+    }
+
+    /// Bounds, areas and middles of all nodes, children before their parents.
     fn sum_up(&mut self) {
         let (mut order, mut at) = (vec![0], 0);
         while at < order.len() {
@@ -79,6 +85,7 @@ impl Tree {
         for &i in order.iter().rev() {
             let node = &self.nodes[i];
             let (mut area, mut middle, mut size) = (Vec3::ZERO, Vec3::ZERO, 0.0);
+            let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
             let mut add = |part: Vec3, at: Vec3, weight: f32| {
                 area += part;
                 middle += weight * at;
@@ -86,15 +93,19 @@ impl Tree {
             };
             if node.count == 0 {
                 let first = node.first as usize;
-                (first..first + 2).for_each(|c| add(self.nodes[c].area, self.nodes[c].middle, sizes[c]));
+                for c in [first, first + 1] {
+                    add(self.nodes[c].area, self.nodes[c].middle, sizes[c]);
+                    (low, high) = (low.min(self.nodes[c].low), high.max(self.nodes[c].high));
+                }
             }
             for &Tri([a, b, c]) in &self.triangles[leaf(node)] {
                 let area = 0.5 * (b - a).cross(c - a);
                 add(area, (a + b + c) / 3.0, area.length());
+                (low, high) = (low.min(a).min(b).min(c), high.max(a).max(b).max(c));
             }
             sizes[i] = size;
             let node = &mut self.nodes[i];
-            node.area = area;
+            (node.low, node.high, node.area) = (low, high, area);
             node.middle = if size > 0.0 { middle / size } else { 0.5 * (node.low + node.high) };
             node.far = FAR * FAR * (node.middle - node.low).max(node.high - node.middle).length_squared();
         }

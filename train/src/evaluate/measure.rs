@@ -2,10 +2,9 @@
 
 use super::way::Ways;
 use super::{Film, Played, Setup, Solids};
-use egogen::body::{BodyModel, MARKER_DIM, PARAMS, ShapedBody, joint, smplx_weights};
+use egogen::body::{BETAS, BodyModel, MARKER_DIM, PARAMS, ShapedBody, joint, smplx_weights};
 use egogen::metrics::{
-    box_distance, contact_score, deepest, final_distance, least_distance, meets_outline, occupancy, passes_left, path_length,
-    time_to_reach, vertices_inside,
+    box_distance, contact_score, deepest, final_distance, least_distance, meets_outline, overlap, passes_left, path_length, time_to_reach,
 };
 use egogen::motion::FPS;
 use egogen::scene::{BoxObstacle, Polygon, Solid};
@@ -95,7 +94,10 @@ pub fn measure(setup: &Setup, played: &mut [Played]) {
         return;
     }
     let mut measured: Vec<Measured> = tracks.par_iter().enumerate().map(|(i, track)| alone(setup, i, track)).collect();
-    let together: Vec<Vec<[f32; 3]>> = setup.groups().par_iter().map(|group| among(group, &tracks)).collect();
+    let mut rest = Vec::new();
+    model.rest_vertices(&[0.0; BETAS], &mut rest);
+    let rest = Solid::new(&rest, model.faces()).ok();
+    let together: Vec<Vec<[f32; 3]>> = setup.groups().par_iter().map(|group| among(group, &tracks, rest.as_ref())).collect();
     for (i, figures) in setup.groups().iter().flatten().zip(together.into_iter().flatten()) {
         [measured[*i].inside_frames, measured[*i].inside_vertices, measured[*i].occupancy] = figures;
     }
@@ -166,28 +168,36 @@ fn room(solids: Option<&Solids>, v: Vec3) -> f32 {
     solids.map_or(f32::INFINITY, |s| s.sdf.at(v))
 }
 
-/// Of each person of a scene: share of its frames inside others, vertices inside them and occupancy, means over the frames.
-fn among(group: &[usize], tracks: &[Track]) -> Vec<[f32; 3]> {
+/// Of each person of a scene: share of its frames inside others, vertices inside them and occupancy, means over the frames. `rest`: the body
+/// at rest.
+fn among(group: &[usize], tracks: &[Track], rest: Option<&Solid>) -> Vec<[f32; 3]> {
     if group.len() < 2 {
         return vec![[f32::NAN; 3]; group.len()];
     }
     let tracks: Vec<&Track> = group.iter().map(|&i| &tracks[i]).collect();
     let longest = tracks.iter().map(|t| t.len()).max().unwrap_or(0);
-    let mut sums = vec![[0.0f32; 4]; group.len()];
-    for t in (0..longest).step_by(EVERY) {
-        let bodies: Vec<Body> = tracks.iter().map(|track| Body::new(track.vertices(t))).collect();
-        for (i, sum) in sums.iter_mut().enumerate().filter(|(i, _)| t < tracks[*i].len()) {
-            let (mut inside, mut occupied) = (0.0, 0.0);
-            for other in bodies.iter().enumerate().filter(|(j, b)| *j != i && b.near(&bodies[i])).map(|(_, b)| b) {
-                if let Some(solid) = other.solid(tracks[i].model) {
-                    inside += vertices_inside(&bodies[i].vertices, solid) as f32;
-                    occupied += occupancy(&bodies[i].vertices, solid);
-                }
-            }
-            sum.iter_mut().zip([f32::from(inside > 0.0), inside, occupied, 1.0]).for_each(|(s, v)| *s += v);
-        }
-    }
-    sums.into_iter().map(|[frames, inside, occupied, n]| [frames / n, inside / n, occupied / n]).collect()
+    let times: Vec<usize> = (0..longest).step_by(EVERY).collect();
+    let frames: Vec<Vec<[f32; 2]>> = times.par_iter().map(|&t| overlaps(&tracks, t, rest)).collect();
+    let of = |(i, track): (usize, &&Track)| {
+        let own = frames.iter().zip(&times).filter(|(_, t)| **t < track.len()).map(|(frame, _)| frame[i]);
+        let add = |[frames, inside, occupied, n]: [f32; 4], [vertices, occupancy]: [f32; 2]| {
+            [frames + f32::from(vertices > 0.0), inside + vertices, occupied + occupancy, n + 1.0]
+        };
+        let [frames, inside, occupied, n] = own.fold([0.0; 4], add);
+        [frames / n, inside / n, occupied / n]
+    };
+    tracks.iter().enumerate().map(of).collect()
+}
+
+/// Of each person in frame `t`: vertices inside others, and occupancy there; of who has ended nothing.
+fn overlaps(tracks: &[&Track], t: usize, rest: Option<&Solid>) -> Vec<[f32; 2]> {
+    let bodies: Vec<Body> = tracks.iter().map(|track| Body::new(track.vertices(t))).collect();
+    let of = |i: usize| {
+        let others = bodies.iter().enumerate().filter(|(j, other)| *j != i && t < tracks[i].len() && other.near(&bodies[i]));
+        let shared = others.filter_map(|(_, other)| Some(overlap(&bodies[i].vertices, other.solid(rest)?)));
+        shared.fold([0.0; 2], |[vertices, occupancy], o| [vertices + o.vertices as f32, occupancy + o.occupancy])
+    };
+    (0..tracks.len()).map(of).collect()
 }
 
 /// A body of one frame.
@@ -209,8 +219,8 @@ impl Body {
     }
 
     /// What the body encloses; made when first asked for.
-    fn solid(&self, model: &BodyModel) -> Option<&Solid> {
-        self.solid.get_or_init(|| Solid::new(&self.vertices, model.faces()).ok()).as_ref()
+    fn solid(&self, rest: Option<&Solid>) -> Option<&Solid> {
+        self.solid.get_or_init(|| rest?.moved(&self.vertices).ok()).as_ref()
     }
 }
 

@@ -155,7 +155,8 @@ fn what_no_task_could_do_is_refused_before_any_begins() {
 fn endless(dir: &Path, out: &Path) -> Child {
     let file = files(dir, "[grid]\n'run.epochs' = [1000000, 1000001]");
     let child = program(&["sweep", text(&file), "--out", text(out), "--jobs", "2"]).stderr(Stdio::null()).stdout(Stdio::null()).spawn();
-    (0..2).for_each(|seed| wait_for(|| out.join(format!("settings/001/seed-{seed}/metrics.csv")).exists()));
+    let rows = |seed| fs::read_to_string(out.join(format!("settings/001/seed-{seed}/metrics.csv"))).map_or(0, |t| t.lines().count());
+    (0..2).for_each(|seed| wait_for(|| rows(seed) > 1));
     child.unwrap()
 }
 

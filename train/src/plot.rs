@@ -92,7 +92,8 @@ pub fn marked_lines(titles: Titles, y: Range<f64>, series: &[Series], marks: &Ma
         let half = s.band.iter().flat_map(|b| b.half.iter().copied());
         s.points.iter().zip(half).map(|(&(x, y), d)| (x, (y - d).max(low), (y + d).min(high))).collect()
     };
-    let y = series.iter().flat_map(edges).fold(lines, |r, p| r.start.min(p.1)..r.end.max(p.2));
+    let chosen = marks.chosen.iter().map(|&(x, y)| (x, y, y));
+    let y = series.iter().flat_map(edges).chain(chosen).fold(lines, |r, p| r.start.min(p.1)..r.end.max(p.2));
     let edge = 0.04 * (y.end - y.start);
     let y = y.start - edge..y.end + edge;
     let keys = keys(series);
@@ -109,6 +110,9 @@ pub fn marked_lines(titles: Titles, y: Range<f64>, series: &[Series], marks: &Ma
                 chart.draw_series([Polygon::new(ring, colour.mix(0.18))])?;
             }
             chart.draw_series(LineSeries::new(s.points.iter().copied(), colour.stroke_width(2)))?;
+            if let [at] = s.points[..] {
+                chart.draw_series([Circle::new(at, 3, colour.filled())])?;
+            }
         }
         chart.draw_series(marks.chosen.iter().map(|&at| Circle::new(at, 5, BLACK.stroke_width(2))))?;
         legend(&lower, &keys)
@@ -345,6 +349,8 @@ mod tests {
         let circles =
             |marks: &Marks| marked_lines(TITLES, 0.0..1.0, std::slice::from_ref(&series), marks).unwrap().matches("<circle").count();
         assert_eq!((circles(&marks), circles(&Marks::default())), (1, 0));
+        let single = Series { points: vec![(1.0, 2.0)], ..series.clone() };
+        assert_eq!(lines(TITLES, 0.0..1.0, &[single]).unwrap().matches("<circle").count(), 1, "a line of one point is a point");
         let plot = histogram(TITLES, -1.0..1.0, &[("a", &[1.0, 3.0]), ("b", &[0.0, 0.0])]).unwrap();
         assert!(plot.matches("<polyline").count() >= 2);
         // Two of three cells are filled.

@@ -1,6 +1,6 @@
 //! Steps of people per second against how many there are, in one scene and in many, acting by the shipped policy.
 //!
-//! `cargo run --release -p egogen-train --example crowd_speed`
+//! `cargo run --release --example crowd_speed`
 
 use egogen::agent::bundle::Bundle;
 use egogen::sim::World;

@@ -39,6 +39,16 @@ fn table(output: &Output) -> Vec<Vec<String>> {
 }
 
 #[test]
+fn the_examples_can_be_run() {
+    let (dir, examples) = (tempfile::tempdir().unwrap(), Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/examples"));
+    let out = dir.path().join("out");
+    let planned = sweep(&examples.join("sweep/loss_and_reward.toml"), &out, &["--plan"]);
+    assert_eq!(planned.status.code(), Some(0), "{}", stderr(&planned));
+    assert_eq!(fs::read_to_string(out.join("manifest.jsonl")).unwrap().lines().count(), 4 * 3);
+    succeed(&[text(&examples.join("strict.toml")), "--dry-run"]);
+}
+
+#[test]
 fn a_grid_is_trained_once_and_tabulated() {
     let dir = tempfile::tempdir().unwrap();
     let out = dir.path().join("out");

@@ -1,7 +1,8 @@
 //! What an evaluation found, as one HTML page.
 
-use super::figures::{Better, Column, FIGURES, OF_STARTS, parts};
+use super::figures::{Better, FIGURES, OF_STARTS};
 use super::pictures::{failures, plans, worst};
+use super::rows::{Column, parts};
 use super::{Estimate, Fate, Played, Row, Setup};
 use crate::Result;
 use crate::html::{Cell, Page, Picture};

@@ -4,7 +4,7 @@
 
 use egogen::agent::{Network, ObsGroup, ObsLayout, PolicyConfig, PolicySpec};
 use egogen::body::{BETAS, MARKER_DIM, PARAMS};
-use egogen::kernels::{Decoder, PolicyEngine, Regressor};
+use egogen::kernels::{Decoder, Mat, PolicyEngine, Regressor, product};
 use egogen::motion::{CONTINUOUS, Dense, FUTURE, Gru, PredictorSizes, PredictorWeights, RegressorSizes, RegressorWeights, SEED};
 use rand::RngExt;
 use std::hint::black_box;
@@ -78,6 +78,32 @@ fn ceiling<'a>() -> Case<'a> {
     ("gemm 1024^3", 2.0 * (N * N * N) as f64, Box::new(run))
 }
 
+/// x W^T for 128 people on one thread as learning takes it, with weights of 12 layers that come from memory: here, and by the library.
+fn fresh_weights<'a>() -> [Case<'a>; 2] {
+    const ROWS: usize = 128;
+    const SIZE: usize = 1152;
+    let flop = 2.0 * (12 * ROWS * SIZE * SIZE) as f64;
+    let make = || (noise(ROWS * SIZE, 1.0), (0..12).map(|_| noise(SIZE * SIZE, 1.0)).collect::<Vec<_>>(), vec![0.0f32; ROWS * SIZE]);
+    let (x, layers, mut y) = make();
+    let own = move || {
+        layers.iter().for_each(|w| product(Mat::new(&x, ROWS, SIZE), Mat::new(w, SIZE, SIZE).t(), &mut y, SIZE, false));
+        black_box(&y);
+    };
+    let (x, layers, mut y) = make();
+    let library = move || {
+        let (n, threads) = (SIZE as isize, gemm::Parallelism::None);
+        for w in &layers {
+            // SAFETY: x and y are ROWS x SIZE floats, w SIZE x SIZE, which is read transposed.
+            unsafe {
+                let (y, x, w) = (y.as_mut_ptr(), x.as_ptr(), w.as_ptr());
+                gemm::gemm(ROWS, SIZE, SIZE, y, 1, n, false, x, 1, n, w, n, 1, 0.0, 1.0, false, false, false, threads);
+            }
+        }
+        black_box(&y);
+    };
+    [("x W^T, one thread", flop, Box::new(own)), ("the same by gemm", flop, Box::new(library))]
+}
+
 fn main() {
     let (decoder, regressor) = (Decoder::new(&predictor()).expect("shapes"), Regressor::new(&regressor()).expect("shapes"));
     let (seed, latent) = (noise(PEOPLE * SEED * MARKER_DIM, 1.0), noise(PEOPLE * decoder.latent_dim(), 1.0));
@@ -103,6 +129,7 @@ fn main() {
         ("policy in burn", policy_flop, Box::new(|| drop(black_box(network.forward(&obs).mu.into_data())))),
         ("packing the policy", 0.0, Box::new(|| drop(black_box(PolicyEngine::new(&spec, &flat))))),
     ];
+    cases.extend(fresh_weights());
     let mut best = vec![f64::INFINITY; cases.len()];
     for _ in 0..ROUNDS {
         for ((_, _, run), best) in cases.iter_mut().zip(&mut best) {

@@ -1,6 +1,6 @@
 //! Fully connected layers over packed weights.
 
-use super::simd::{self, GROUP, Isa, Lane, PANEL};
+use super::simd::{self, Finish, GROUP, Isa, Lane, PANEL};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -100,13 +100,10 @@ impl Linear {
         }
         let (inputs, panels) = (columns.len(), outputs.div_ceil(PANEL));
         let mut layer = Self { inputs, outputs, weight: vec![Lane([0.0; PANEL]); panels * inputs], bias: vec![Lane([0.0; PANEL]); panels] };
-        // A panel reads 32 rows side by side and writes in order; the policy's 50 MB are packed anew after every update.
+        // The policy's 50 MB are packed anew after every update.
+        let isa = Isa::best();
         layer.weight.par_chunks_exact_mut(inputs).zip(weight.par_chunks(PANEL * row)).for_each(|(panel, rows)| {
-            for (lane, k) in panel.iter_mut().zip(columns.clone()) {
-                for (v, row) in lane.0.iter_mut().zip(rows.chunks_exact(row)) {
-                    *v = row[k];
-                }
-            }
+            simd::transpose(isa, &rows[columns.start..], row, rows.len() / row, panel);
         });
         for (o, b) in bias.iter().enumerate() {
             layer.bias[o / PANEL].0[o % PANEL] = *b;
@@ -146,22 +143,11 @@ impl Linear {
             for g in 0..groups {
                 let (start, end) = (g * rows / groups, (g + 1) * rows / groups);
                 let tile = &mut tile[..end - start];
-                simd::product(isa, x.row(start), x.stride, panel, tile);
-                if let Source::Plus(v) = source {
-                    for (r, lane) in tile.iter_mut().enumerate() {
-                        let v = &v.row(start + r)[first..first + width];
-                        lane.0.iter_mut().zip(v).for_each(|(t, v)| *t += v);
-                    }
-                }
-                simd::finish(isa, tile, bias, activation);
-                for (r, lane) in tile.iter().enumerate() {
-                    let at = (start + r) * y.stride + first;
-                    let y = &mut y.data[at..at + width];
-                    match source {
-                        Source::Residual => y.iter_mut().zip(&lane.0).for_each(|(y, t)| *y += t),
-                        _ => y.copy_from_slice(&lane.0[..width]),
-                    }
-                }
+                simd::product(isa, x.row(start), [x.stride, 1], panel, tile);
+                let plus = if let Source::Plus(v) = source { Some((&v.row(start)[first..], v.stride)) } else { None };
+                let residual = matches!(source, Source::Residual);
+                let how = Finish { bias, plus, activation, residual, width };
+                simd::finish(isa, tile, &how, &mut y.data[start * y.stride + first..], y.stride);
             }
         }
     }
@@ -201,20 +187,23 @@ mod tests {
             for source in 0..3 {
                 let before = noise(rows * ys, seed + 3);
                 let other = noise(rows * ys, seed + 4);
-                let run = |isa| {
+                let run = |isa, activation| {
                     let mut y = before.clone();
                     let source = match source {
                         0 => Source::Fresh,
                         1 => Source::Plus(View::new(&other, ys)),
                         _ => Source::Residual,
                     };
-                    layer.forward_with(isa, rows, View::new(&x, xs), ViewMut::new(&mut y, ys), source, Activation::Relu);
+                    layer.forward_with(isa, rows, View::new(&x, xs), ViewMut::new(&mut y, ys), source, activation);
                     y
                 };
-                let y = run(Isa::best());
-                for isa in Isa::available() {
-                    prop_assert_eq!(&y, &run(isa), "{:?} gives other bits", isa);
+                for activation in [Activation::None, Activation::Tanh, Activation::Sigmoid, Activation::Relu, Activation::LeakyRelu(0.1)] {
+                    let y = run(Isa::best(), activation);
+                    for isa in Isa::available() {
+                        prop_assert_eq!(&y, &run(isa, activation), "{:?} gives other bits for {:?}", isa, activation);
+                    }
                 }
+                let y = run(Isa::best(), Activation::Relu);
                 for r in 0..rows {
                     let want = reference(&x[r * xs..r * xs + inputs], &weight, &bias);
                     for (o, want) in want.iter().enumerate() {

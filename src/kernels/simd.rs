@@ -1,9 +1,11 @@
 //! Instruction-set dependent loops, chosen at run time: AVX-512, AVX2 with FMA, portable.
 //!
-//! Only the inner product of a tile is written with intrinsics. The element-wise loops are plain Rust that is inlined into
-//! a function with the right target features and vectorised there.
+//! Products of tiles and, for AVX-512, what follows them are written with intrinsics (`x86.rs`). The other element-wise loops are plain
+//! Rust that is inlined into a function with the right target features and vectorised there.
 
 use super::linear::Activation;
+#[cfg(target_arch = "x86_64")]
+use super::x86;
 
 /// Outputs of a weight panel.
 pub const PANEL: usize = 32;
@@ -75,21 +77,6 @@ macro_rules! multiversion {
 pub(super) use multiversion;
 
 multiversion! {
-    /// Adds `bias` to the rows of a tile and applies the activation.
-    finish = finish_body(rows: &mut [Lane], bias: &Lane, activation: Activation)
-}
-
-#[inline(always)]
-fn finish_body(rows: &mut [Lane], bias: &Lane, activation: Activation) {
-    for row in rows {
-        for (v, b) in row.0.iter_mut().zip(&bias.0) {
-            *v += b;
-        }
-        activate(&mut row.0, activation);
-    }
-}
-
-multiversion! {
     /// Applies `activation` to every value.
     apply = activate(values: &mut [f32], activation: Activation)
 }
@@ -123,16 +110,20 @@ fn gates_body(input: &[f32], hidden: &[f32], h: &mut [f32]) {
     }
 }
 
-/// Hyperbolic tangent as an odd rational function of degree 13 over 6, error below 4e-7; not a number stays so.
+/// tanh as an odd rational function of degree 13 over 6: coefficients from the highest power down.
+pub const TANH_P: [f32; 7] =
+    [-2.760_768_5e-16, 2.000_188e-13, -8.604_672e-11, 5.122_297_3e-8, 1.485_722_4e-5, 6.372_619_4e-4, 4.893_524_6e-3];
+pub const TANH_Q: [f32; 4] = [1.198_258_4e-6, 1.185_347_1e-4, 2.268_434_7e-3, 4.893_525_3e-3];
+/// Beyond this tanh is one to the last bit, and the fraction would leave [-1, 1].
+pub const TANH_END: f32 = 7.905_311;
+
+/// Hyperbolic tangent, error below 4e-7; not a number stays so.
 #[inline(always)]
 fn tanh(x: f32) -> f32 {
-    const P: [f32; 7] = [-2.760_768_5e-16, 2.000_188e-13, -8.604_672e-11, 5.122_297_3e-8, 1.485_722_4e-5, 6.372_619_4e-4, 4.893_524_6e-3];
-    const Q: [f32; 4] = [1.198_258_4e-6, 1.185_347_1e-4, 2.268_434_7e-3, 4.893_525_3e-3];
-    // Beyond this the function is one to the last bit, and the fraction would leave [-1, 1].
-    let x = x.clamp(-7.905_311, 7.905_311);
+    let x = x.clamp(-TANH_END, TANH_END);
     let x2 = x * x;
-    let p = P[1..].iter().fold(P[0], |s, &c| s.mul_add(x2, c));
-    let q = Q[1..].iter().fold(Q[0], |s, &c| s.mul_add(x2, c));
+    let p = TANH_P[1..].iter().fold(TANH_P[0], |s, &c| s.mul_add(x2, c));
+    let q = TANH_Q[1..].iter().fold(TANH_Q[0], |s, &c| s.mul_add(x2, c));
     x * p / q
 }
 
@@ -141,27 +132,31 @@ fn sigmoid(x: f32) -> f32 {
     tanh(0.5 * x).mul_add(0.5, 0.5)
 }
 
-/// `out[r] = x[r] W` for `out.len()` rows (at most `GROUP`) that lie `stride` apart in `x`; `panel` has one lane per input.
+/// `out[r] = x[r] W` for `out.len()` rows (at most `GROUP`); `panel` has one lane per input. Input k of row r is
+/// `x[r * row + k * input]`, and one of the strides `[row, input]` is 1.
 ///
 /// # Panics
-/// If `x` is too short.
-pub fn product(isa: Isa, x: &[f32], stride: usize, panel: &[Lane], out: &mut [Lane]) {
-    assert!(out.len() <= GROUP && (out.is_empty() || x.len() >= (out.len() - 1) * stride + panel.len()));
+/// If `x` is too short or no stride is 1.
+pub fn product(isa: Isa, x: &[f32], [row, input]: [usize; 2], panel: &[Lane], out: &mut [Lane]) {
+    let Some((rows, inputs)) = out.len().checked_sub(1).zip(panel.len().checked_sub(1)) else {
+        return out.fill(Lane([0.0; PANEL]));
+    };
+    assert!(rows < GROUP && x.len() > rows * row + inputs * input && (row == 1 || input == 1));
     match isa {
         // SAFETY: the processor has the features; the length of `x` was checked.
         #[cfg(target_arch = "x86_64")]
-        Isa::Avx512 => unsafe { x86::product_512(x.as_ptr(), stride, panel, out) },
+        Isa::Avx512 => unsafe { x86::product_512(x.as_ptr(), [row, input], panel, out) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        Isa::Avx2 => unsafe { x86::product_256(x.as_ptr(), stride, panel, out) },
-        Isa::Portable => product_portable(x, stride, panel, out),
+        Isa::Avx2 => unsafe { x86::product_256(x.as_ptr(), [row, input], panel, out) },
+        Isa::Portable => product_portable(x, [row, input], panel, out),
     }
 }
 
-fn product_portable(x: &[f32], stride: usize, panel: &[Lane], out: &mut [Lane]) {
-    for (row, out) in out.iter_mut().enumerate() {
+fn product_portable(x: &[f32], [row, input]: [usize; 2], panel: &[Lane], out: &mut [Lane]) {
+    for (r, out) in out.iter_mut().enumerate() {
         let mut sum = [0.0; PANEL];
-        for (x, lane) in x[row * stride..].iter().zip(panel) {
+        for (x, lane) in x[r * row..].iter().step_by(input).zip(panel) {
             for (s, w) in sum.iter_mut().zip(&lane.0) {
                 *s = x.mul_add(*w, *s);
             }
@@ -170,93 +165,69 @@ fn product_portable(x: &[f32], stride: usize, panel: &[Lane], out: &mut [Lane]) 
     }
 }
 
-#[cfg(target_arch = "x86_64")]
-mod x86 {
-    use super::Lane;
-    use std::arch::x86_64::*;
+/// How a tile's sums become outputs: f(sum + bias + plus), added to what is there if `residual`.
+pub struct Finish<'a> {
+    pub bias: &'a Lane,
+    /// Rows of `width` floats, and how far they lie apart.
+    pub plus: Option<(&'a [f32], usize)>,
+    pub activation: Activation,
+    pub residual: bool,
+    /// Outputs in use, at most `PANEL`.
+    pub width: usize,
+}
 
-    /// # Safety
-    /// The processor has AVX-512F; `x` points to `(out.len() - 1) * stride + panel.len()` floats; `out` has at most 12 rows.
-    #[target_feature(enable = "avx512f")]
-    pub unsafe fn product_512(x: *const f32, stride: usize, panel: &[Lane], out: &mut [Lane]) {
-        macro_rules! rows {
-            ($($n:literal)*) => {
-                // SAFETY: the caller's promise, with exactly `$n` rows.
-                match out.len() { $($n => unsafe { tile_512::<$n>(x, stride, panel, out) },)* _ => {} }
-            };
-        }
-        rows!(1 2 3 4 5 6 7 8 9 10 11 12)
+/// Writes the outputs of a tile to the rows of `y`, which lie `stride` floats apart.
+///
+/// # Panics
+/// If `y` or the rows to add are too short.
+pub fn finish(isa: Isa, tile: &mut [Lane], how: &Finish, y: &mut [f32], stride: usize) {
+    let Some(last) = tile.len().checked_sub(1) else { return };
+    assert!(how.width <= PANEL && y.len() >= last * stride + how.width);
+    assert!(how.plus.is_none_or(|(rows, stride)| rows.len() >= last * stride + how.width));
+    #[cfg(target_arch = "x86_64")]
+    if isa == Isa::Avx512 {
+        // SAFETY: the processor has the features; the lengths were checked.
+        return unsafe { x86::finish_512(tile, how, y.as_mut_ptr(), stride) };
     }
-
-    /// # Safety
-    /// As `product_512`, and `out` has `R` rows.
-    #[target_feature(enable = "avx512f")]
-    unsafe fn tile_512<const R: usize>(x: *const f32, stride: usize, panel: &[Lane], out: &mut [Lane]) {
-        let mut sum = [[_mm512_setzero_ps(); 2]; R];
-        for (k, lane) in panel.iter().enumerate() {
-            // SAFETY: a lane is 32 floats on a cache line; row and input are within `x`.
-            unsafe {
-                let w = [_mm512_load_ps(lane.0.as_ptr()), _mm512_load_ps(lane.0.as_ptr().add(16))];
-                for (row, sum) in sum.iter_mut().enumerate() {
-                    let v = _mm512_set1_ps(*x.add(row * stride + k));
-                    sum[0] = _mm512_fmadd_ps(v, w[0], sum[0]);
-                    sum[1] = _mm512_fmadd_ps(v, w[1], sum[1]);
-                }
-            }
+    for (r, lane) in tile.iter_mut().enumerate() {
+        lane.0.iter_mut().zip(&how.bias.0).for_each(|(v, b)| *v += b);
+        if let Some((rows, stride)) = how.plus {
+            lane.0.iter_mut().zip(&rows[r * stride..][..how.width]).for_each(|(v, p)| *v += p);
         }
-        for (sum, out) in sum.iter().zip(out) {
-            // SAFETY: as above.
-            unsafe {
-                _mm512_store_ps(out.0.as_mut_ptr(), sum[0]);
-                _mm512_store_ps(out.0.as_mut_ptr().add(16), sum[1]);
-            }
+        apply(isa, &mut lane.0, how.activation);
+        let y = &mut y[r * stride..][..how.width];
+        match how.residual {
+            true => y.iter_mut().zip(&lane.0).for_each(|(y, v)| *y += v),
+            false => y.copy_from_slice(&lane.0[..how.width]),
         }
     }
+}
 
-    /// # Safety
-    /// The processor has AVX2 and FMA; otherwise as `product_512`.
-    #[target_feature(enable = "avx2,fma")]
-    pub unsafe fn product_256(x: *const f32, stride: usize, panel: &[Lane], out: &mut [Lane]) {
-        // Sixteen registers: tiles of 6 rows x 16 outputs.
-        for (group, out) in out.chunks_mut(6).enumerate() {
-            for half in 0..2 {
-                macro_rules! rows {
-                    ($($n:literal)*) => {
-                        // SAFETY: the caller's promise, with exactly `$n` rows.
-                        match out.len() { $($n => unsafe { tile_256::<$n>(x.add(group * 6 * stride), stride, panel, half, out) },)* _ => {} }
-                    };
-                }
-                rows!(1 2 3 4 5 6)
-            }
-        }
+/// Lane k of `panel` gets value k of every row; `count` (at most `PANEL`) rows lie `stride` floats apart, zeros stand for the others.
+///
+/// # Panics
+/// If `rows` is too short.
+pub fn transpose(isa: Isa, rows: &[f32], stride: usize, count: usize, panel: &mut [Lane]) {
+    assert!(count <= PANEL && (count == 0 || rows.len() >= (count - 1) * stride + panel.len()));
+    #[cfg(target_arch = "x86_64")]
+    if isa == Isa::Avx512 {
+        // SAFETY: the processor has the features; the length was checked.
+        return unsafe { x86::transpose_512(rows.as_ptr(), stride, count, panel) };
     }
+    for (k, lane) in panel.iter_mut().enumerate() {
+        lane.0 = std::array::from_fn(|r| if r < count { rows[r * stride + k] } else { 0.0 });
+    }
+}
 
-    /// # Safety
-    /// As `product_256`; `out` has `R` rows; `half` is 0 or 1.
-    #[target_feature(enable = "avx2,fma")]
-    unsafe fn tile_256<const R: usize>(x: *const f32, stride: usize, panel: &[Lane], half: usize, out: &mut [Lane]) {
-        let mut sum = [[_mm256_setzero_ps(); 2]; R];
-        for (k, lane) in panel.iter().enumerate() {
-            // SAFETY: a lane is 32 floats on a cache line; row and input are within `x`.
-            unsafe {
-                let w = lane.0.as_ptr().add(16 * half);
-                let w = [_mm256_load_ps(w), _mm256_load_ps(w.add(8))];
-                for (row, sum) in sum.iter_mut().enumerate() {
-                    let v = _mm256_set1_ps(*x.add(row * stride + k));
-                    sum[0] = _mm256_fmadd_ps(v, w[0], sum[0]);
-                    sum[1] = _mm256_fmadd_ps(v, w[1], sum[1]);
-                }
-            }
-        }
-        for (sum, out) in sum.iter().zip(out) {
-            // SAFETY: as above.
-            unsafe {
-                let out = out.0.as_mut_ptr().add(16 * half);
-                _mm256_store_ps(out, sum[0]);
-                _mm256_store_ps(out.add(8), sum[1]);
-            }
-        }
+/// Asks for `values` to be brought to the second-level cache.
+pub fn prefetch(values: &[f32]) {
+    #[cfg(target_arch = "x86_64")]
+    for line in values.chunks(16) {
+        // SAFETY: every x86-64 processor has this, and it reads nothing.
+        unsafe { std::arch::x86_64::_mm_prefetch::<{ std::arch::x86_64::_MM_HINT_T1 }>(line.as_ptr().cast()) };
     }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = values;
 }
 
 #[cfg(test)]
@@ -278,6 +249,28 @@ mod tests {
                 assert!((f64::from(t) - x.tanh()).abs() < 4e-7, "{isa:?} tanh {x}: {t}");
                 assert!((f64::from(s) - 1.0 / (1.0 + (-x).exp())).abs() < 4e-7, "{isa:?} sigmoid {x}: {s}");
                 assert!(t.abs() <= 1.0 && (0.0..=1.0).contains(&s), "{isa:?} range at {x}: {t} {s}");
+            }
+        }
+    }
+
+    #[test]
+    fn transposes_and_tiles_are_the_same_on_every_instruction_set() {
+        let data: Vec<f32> = (0..40 * 40).map(|i| ((i * 7919 % 1000) as f32 - 500.0) / 500.0).collect();
+        for (isa, count, inputs) in
+            Isa::available().flat_map(|isa| [(isa, 0, 5), (isa, 1, 33), (isa, 16, 16), (isa, 19, 37), (isa, 32, 40)])
+        {
+            let mut panel = vec![Lane([9.0; PANEL]); inputs];
+            transpose(isa, &data, 40, count, &mut panel);
+            for (k, lane) in panel.iter().enumerate() {
+                let want: [f32; PANEL] = std::array::from_fn(|r| if r < count { data[40 * r + k] } else { 0.0 });
+                assert_eq!(lane.0, want, "{isa:?} {count} x {inputs}");
+            }
+            // Rows apart, and rows side by side.
+            for (strides, rows) in [[40, 1], [1, 40]].into_iter().flat_map(|s| (0..=GROUP).map(move |n| (s, n))) {
+                let (mut out, mut want) = (vec![Lane([9.0; PANEL]); rows], vec![Lane([9.0; PANEL]); rows]);
+                product(isa, &data, strides, &panel, &mut out);
+                product_portable(&data, strides, &panel, &mut want);
+                assert!(out.iter().zip(&want).all(|(a, b)| a.0 == b.0), "{isa:?} {rows} rows at {strides:?}");
             }
         }
     }

@@ -4,6 +4,7 @@ use super::people::{JOINT_DIM, PersonMut};
 use super::plant::plant;
 use super::{People, Primitives};
 use crate::body::{BETAS, BodyModel, MARKER_DIM, PARAMS, POSE, ShapedBody, TRANSL};
+use crate::kernels::first_not_finite;
 use crate::motion::clip::Skeleton;
 use crate::motion::{FRAMES, FUTURE, MotionModel, Origin, SEED};
 use crate::{Error, Result};
@@ -206,7 +207,7 @@ fn smooth_seam(params: &mut [f32]) {
 }
 
 fn all_finite(what: &str, data: &[f32], each: usize) -> Result<()> {
-    match data.iter().position(|v| !v.is_finite()) {
+    match first_not_finite(data) {
         Some(i) => Err(Error::invalid(format!("{what} of person {} are not finite: entry {} is {}", i / each, i % each, data[i]))),
         None => Ok(()),
     }

@@ -3,6 +3,7 @@
 use crate::acts::Acts;
 use crate::policy::Policy;
 use crate::{Error, Result};
+use egogen::kernels::first_not_finite;
 use egogen_envs::{EnvSpec, StepResult, VecEnv};
 use serde::{Deserialize, Serialize};
 
@@ -197,7 +198,7 @@ fn check_obs(spec: &EnvSpec, obs: &[f32]) -> Result<()> {
 
 /// `width` numbers of each environment; `name` says what the k-th is.
 fn check_finite(width: usize, values: &[f32], name: impl Fn(usize) -> String) -> Result<()> {
-    match values.iter().position(|v| !v.is_finite()) {
+    match first_not_finite(values) {
         Some(i) => {
             let (env, k) = (i / width.max(1), i % width.max(1));
             Err(Error::run(format!("environment {env} returned {} for {}", values[i], name(k))))

@@ -1,0 +1,223 @@
+//! Loops written with intrinsics.
+
+use super::linear::Activation;
+use super::simd::{Finish, Lane, TANH_END, TANH_P, TANH_Q};
+use std::arch::x86_64::*;
+
+/// # Safety
+/// The processor has AVX-512F; `out` has at most 12 rows; `x` holds every input of them at the strides (row, input), one of which is 1.
+#[target_feature(enable = "avx512f")]
+pub unsafe fn product_512(x: *const f32, [row, input]: [usize; 2], panel: &[Lane], out: &mut [Lane]) {
+    macro_rules! rows {
+        ($across:literal, $stride:expr, $($n:literal)*) => {
+            // SAFETY: the caller's promise, with exactly `$n` rows.
+            match out.len() { $($n => unsafe { tile_512::<$n, $across>(x, $stride, panel, out) },)* _ => {} }
+        };
+    }
+    match input {
+        1 => rows!(false, row, 1 2 3 4 5 6 7 8 9 10 11 12),
+        _ => rows!(true, input, 1 2 3 4 5 6 7 8 9 10 11 12),
+    }
+}
+
+/// # Safety
+/// As `product_512`; `out` has `R` rows. `stride` is that of the rows, or of the inputs if `ACROSS`; the other one is 1.
+#[target_feature(enable = "avx512f")]
+unsafe fn tile_512<const R: usize, const ACROSS: bool>(x: *const f32, stride: usize, panel: &[Lane], out: &mut [Lane]) {
+    let mut sum = [[_mm512_setzero_ps(); 2]; R];
+    macro_rules! add {
+        ($k:expr, $lane:expr) => {
+            // SAFETY: a lane is 32 floats on a cache line; row and input are within `x`.
+            unsafe {
+                let w = [_mm512_load_ps($lane.0.as_ptr()), _mm512_load_ps($lane.0.as_ptr().add(16))];
+                for (row, sum) in sum.iter_mut().enumerate() {
+                    let v = _mm512_set1_ps(*x.add(if ACROSS { $k * stride + row } else { row * stride + $k }));
+                    sum[0] = _mm512_fmadd_ps(v, w[0], sum[0]);
+                    sum[1] = _mm512_fmadd_ps(v, w[1], sum[1]);
+                }
+            }
+        };
+    }
+    // Four inputs share the arithmetic on addresses, which would otherwise keep the multipliers waiting.
+    let (fours, rest) = panel.as_chunks::<4>();
+    for (k, four) in fours.iter().enumerate() {
+        add!(4 * k, four[0]);
+        add!(4 * k + 1, four[1]);
+        add!(4 * k + 2, four[2]);
+        add!(4 * k + 3, four[3]);
+    }
+    for (k, lane) in rest.iter().enumerate() {
+        add!(4 * fours.len() + k, lane);
+    }
+    for (sum, out) in sum.iter().zip(out) {
+        // SAFETY: as above.
+        unsafe {
+            _mm512_store_ps(out.0.as_mut_ptr(), sum[0]);
+            _mm512_store_ps(out.0.as_mut_ptr().add(16), sum[1]);
+        }
+    }
+}
+
+/// # Safety
+/// The processor has AVX-512F; the rows of `y` and those to add, `how.width` floats each, are there.
+#[target_feature(enable = "avx512f")]
+pub unsafe fn finish_512(tile: &[Lane], how: &Finish, y: *mut f32, stride: usize) {
+    // SAFETY: the caller's promise.
+    unsafe {
+        match how.activation {
+            Activation::None => finish_rows(tile, how, y, stride, |v| v),
+            Activation::Tanh => finish_rows(tile, how, y, stride, |v| tanh_512(v)),
+            Activation::Sigmoid => {
+                let half = _mm512_set1_ps(0.5);
+                finish_rows(tile, how, y, stride, |v| _mm512_fmadd_ps(tanh_512(_mm512_mul_ps(half, v)), half, half));
+            }
+            // The second operand is what comes out where one is not a number.
+            Activation::Relu => finish_rows(tile, how, y, stride, |v| _mm512_max_ps(_mm512_setzero_ps(), v)),
+            Activation::LeakyRelu(slope) => finish_rows(tile, how, y, stride, |v| {
+                let negative = _mm512_cmp_ps_mask::<_CMP_LT_OQ>(v, _mm512_setzero_ps());
+                _mm512_mask_mul_ps(v, negative, v, _mm512_set1_ps(slope))
+            }),
+        }
+    }
+}
+
+/// # Safety
+/// As `finish_512`.
+#[inline]
+#[target_feature(enable = "avx512f")]
+unsafe fn finish_rows(tile: &[Lane], how: &Finish, y: *mut f32, stride: usize, activate: impl Fn(__m512) -> __m512) {
+    for half in [0, 16].into_iter().filter(|&half| half < how.width) {
+        let mask = first_512(how.width - half);
+        // SAFETY: lanes are 32 floats; only the first `how.width` of a row are touched.
+        unsafe {
+            let bias = _mm512_load_ps(how.bias.0.as_ptr().add(half));
+            for (r, lane) in tile.iter().enumerate() {
+                let mut v = _mm512_add_ps(_mm512_load_ps(lane.0.as_ptr().add(half)), bias);
+                if let Some((rows, stride)) = how.plus {
+                    v = _mm512_add_ps(v, _mm512_maskz_loadu_ps(mask, rows.as_ptr().add(r * stride + half)));
+                }
+                v = activate(v);
+                let y = y.add(r * stride + half);
+                if how.residual {
+                    v = _mm512_add_ps(v, _mm512_maskz_loadu_ps(mask, y));
+                }
+                _mm512_mask_storeu_ps(y, mask, v);
+            }
+        }
+    }
+}
+
+/// A mask of the first `n` of 16.
+fn first_512(n: usize) -> __mmask16 {
+    if n < 16 { (1 << n) - 1 } else { !0 }
+}
+
+/// tanh as `simd::tanh` has it.
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn tanh_512(x: __m512) -> __m512 {
+    let x = _mm512_min_ps(_mm512_set1_ps(TANH_END), _mm512_max_ps(_mm512_set1_ps(-TANH_END), x));
+    let x2 = _mm512_mul_ps(x, x);
+    let (mut p, mut q) = (_mm512_set1_ps(TANH_P[0]), _mm512_set1_ps(TANH_Q[0]));
+    for c in &TANH_P[1..] {
+        p = _mm512_fmadd_ps(p, x2, _mm512_set1_ps(*c));
+    }
+    for c in &TANH_Q[1..] {
+        q = _mm512_fmadd_ps(q, x2, _mm512_set1_ps(*c));
+    }
+    _mm512_div_ps(_mm512_mul_ps(x, p), q)
+}
+
+/// # Safety
+/// The processor has AVX-512F; `rows` points to `count` (at most 32) rows of `panel.len()` floats, `stride` apart.
+#[target_feature(enable = "avx512f")]
+pub unsafe fn transpose_512(rows: *const f32, stride: usize, count: usize, panel: &mut [Lane]) {
+    for (block, lanes) in panel.chunks_mut(16).enumerate() {
+        let mask = first_512(lanes.len());
+        for half in [0, 16] {
+            let mut block_16 = [_mm512_setzero_ps(); 16];
+            for (r, row) in block_16.iter_mut().enumerate().take(count.saturating_sub(half)) {
+                // SAFETY: row and columns are there, the mask leaves out those that are not.
+                *row = unsafe { _mm512_maskz_loadu_ps(mask, rows.add((half + r) * stride + 16 * block)) };
+            }
+            for (lane, column) in lanes.iter_mut().zip(transpose_16(block_16)) {
+                // SAFETY: a lane is 32 floats on a cache line.
+                unsafe { _mm512_store_ps(lane.0.as_mut_ptr().add(half), column) };
+            }
+        }
+    }
+}
+
+/// The columns of 16 rows.
+#[inline]
+#[target_feature(enable = "avx512f")]
+fn transpose_16(r: [__m512; 16]) -> [__m512; 16] {
+    let mut a = [_mm512_setzero_pd(); 16];
+    for i in 0..8 {
+        a[2 * i] = _mm512_castps_pd(_mm512_unpacklo_ps(r[2 * i], r[2 * i + 1]));
+        a[2 * i + 1] = _mm512_castps_pd(_mm512_unpackhi_ps(r[2 * i], r[2 * i + 1]));
+    }
+    // Within every quarter of a register: b[4 i + j] holds column j of the rows 4 i to 4 i + 3.
+    let mut b = [_mm512_setzero_ps(); 16];
+    for i in 0..4 {
+        for j in 0..2 {
+            b[4 * i + 2 * j] = _mm512_castpd_ps(_mm512_unpacklo_pd(a[4 * i + j], a[4 * i + 2 + j]));
+            b[4 * i + 2 * j + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(a[4 * i + j], a[4 * i + 2 + j]));
+        }
+    }
+    let mut out = r;
+    for j in 0..4 {
+        let evens = [_mm512_shuffle_f32x4::<0x88>(b[j], b[4 + j]), _mm512_shuffle_f32x4::<0x88>(b[8 + j], b[12 + j])];
+        let odds = [_mm512_shuffle_f32x4::<0xdd>(b[j], b[4 + j]), _mm512_shuffle_f32x4::<0xdd>(b[8 + j], b[12 + j])];
+        out[j] = _mm512_shuffle_f32x4::<0x88>(evens[0], evens[1]);
+        out[8 + j] = _mm512_shuffle_f32x4::<0xdd>(evens[0], evens[1]);
+        out[4 + j] = _mm512_shuffle_f32x4::<0x88>(odds[0], odds[1]);
+        out[12 + j] = _mm512_shuffle_f32x4::<0xdd>(odds[0], odds[1]);
+    }
+    out
+}
+
+/// # Safety
+/// The processor has AVX2 and FMA; otherwise as `product_512`.
+#[target_feature(enable = "avx2,fma")]
+pub unsafe fn product_256(x: *const f32, [row, input]: [usize; 2], panel: &[Lane], out: &mut [Lane]) {
+    // Sixteen registers: tiles of 6 rows x 16 outputs.
+    for (group, out) in out.chunks_mut(6).enumerate() {
+        for half in 0..2 {
+            macro_rules! rows {
+                ($($n:literal)*) => {
+                    // SAFETY: the caller's promise, with exactly `$n` rows.
+                    match out.len() { $($n => unsafe { tile_256::<$n>(x.add(group * 6 * row), [row, input], panel, half, out) },)* _ => {} }
+                };
+            }
+            rows!(1 2 3 4 5 6)
+        }
+    }
+}
+
+/// # Safety
+/// As `product_256`; `out` has `R` rows; `half` is 0 or 1.
+#[target_feature(enable = "avx2,fma")]
+unsafe fn tile_256<const R: usize>(x: *const f32, [row, input]: [usize; 2], panel: &[Lane], half: usize, out: &mut [Lane]) {
+    let mut sum = [[_mm256_setzero_ps(); 2]; R];
+    for (k, lane) in panel.iter().enumerate() {
+        // SAFETY: a lane is 32 floats on a cache line; row and input are within `x`.
+        unsafe {
+            let w = lane.0.as_ptr().add(16 * half);
+            let w = [_mm256_load_ps(w), _mm256_load_ps(w.add(8))];
+            for (r, sum) in sum.iter_mut().enumerate() {
+                let v = _mm256_set1_ps(*x.add(r * row + k * input));
+                sum[0] = _mm256_fmadd_ps(v, w[0], sum[0]);
+                sum[1] = _mm256_fmadd_ps(v, w[1], sum[1]);
+            }
+        }
+    }
+    for (sum, out) in sum.iter().zip(out) {
+        // SAFETY: as above.
+        unsafe {
+            let out = out.0.as_mut_ptr().add(16 * half);
+            _mm256_store_ps(out, sum[0]);
+            _mm256_store_ps(out.add(8), sum[1]);
+        }
+    }
+}

@@ -1,6 +1,6 @@
 //! Fully connected layers over packed weights.
 
-use super::simd::{self, Finish, GROUP, Isa, Lane, PANEL};
+use super::simd::{self, Finish, Isa, Lane, PANEL};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -32,10 +32,6 @@ pub struct View<'a> {
 impl<'a> View<'a> {
     pub fn new(data: &'a [f32], stride: usize) -> Self {
         Self { data, stride }
-    }
-
-    fn row(self, row: usize) -> &'a [f32] {
-        &self.data[row * self.stride..]
     }
 }
 
@@ -135,20 +131,14 @@ impl Linear {
     }
 
     fn forward_with(&self, isa: Isa, rows: usize, x: View, y: ViewMut, source: Source, activation: Activation) {
-        let groups = rows.div_ceil(GROUP);
-        let mut tile = [Lane([0.0; PANEL]); GROUP];
+        if rows == 0 {
+            return;
+        }
         for (p, (panel, bias)) in self.weight.chunks_exact(self.inputs).zip(&self.bias).enumerate() {
             let (first, width) = (p * PANEL, PANEL.min(self.outputs - p * PANEL));
-            // Groups of nearly equal size: a last group of one row would waste most of the arithmetic units.
-            for g in 0..groups {
-                let (start, end) = (g * rows / groups, (g + 1) * rows / groups);
-                let tile = &mut tile[..end - start];
-                simd::product(isa, x.row(start), [x.stride, 1], panel, tile);
-                let plus = if let Source::Plus(v) = source { Some((&v.row(start)[first..], v.stride)) } else { None };
-                let residual = matches!(source, Source::Residual);
-                let how = Finish { bias, plus, activation, residual, width };
-                simd::finish(isa, tile, &how, &mut y.data[start * y.stride + first..], y.stride);
-            }
+            let plus = if let Source::Plus(v) = source { Some((&v.data[first..], v.stride)) } else { None };
+            let how = Finish { bias, plus, activation, residual: matches!(source, Source::Residual), width };
+            simd::panel_rows(isa, rows, (x.data, [x.stride, 1]), panel, &how, (&mut y.data[first..], y.stride));
         }
     }
 }
@@ -235,6 +225,12 @@ mod tests {
             layer.forward(1, view, ViewMut::new(&mut one, outputs), Source::Fresh, Activation::Tanh);
             prop_assert_eq!(&all[row * outputs..(row + 1) * outputs], &one[..]);
         }
+    }
+
+    #[test]
+    fn nobody_is_no_work() {
+        let layer = Linear::new(&noise(40 * 2, 1), &[], 2).unwrap();
+        layer.forward(0, View::new(&[], 2), ViewMut::new(&mut [], 40), Source::Plus(View::new(&[], 40)), Activation::Tanh);
     }
 
     #[test]

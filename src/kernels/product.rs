@@ -1,10 +1,9 @@
 //! General matrix products for training, where no operand is worth packing ahead.
 
 use super::Activation;
-use super::simd::{self, Finish, GROUP, Isa, Lane, PANEL};
+use super::simd::{self, Finish, Isa, Lane, PANEL};
 use gemm::Parallelism;
 use std::cell::RefCell;
-use std::ops::Range;
 
 /// Most inner indices of a panel, 128 bytes each: the second-level cache holds it beside the rows it meets.
 const BLOCK: usize = 1536;
@@ -93,32 +92,19 @@ pub fn product(a: Mat, b: Mat, dst: &mut [f32], stride: usize, add: bool) {
 /// them at a time, and meet all rows of `a` while they are in the cache.
 fn by_panels(a: Mat, b: Mat, dst: &mut [f32], stride: usize, add: bool) {
     let isa = Isa::best();
-    let mut tile = [Lane([0.0; PANEL]); GROUP];
+    // Blocks of nearly equal length; one of length 0 still writes its zeros.
+    let blocks = a.cols.div_ceil(BLOCK).max(1);
     PANEL_MEMORY.with_borrow_mut(|panel| {
-        for (first, inner) in (0..b.cols).step_by(PANEL).flat_map(|first| parts(a.cols, BLOCK).map(move |inner| (first, inner))) {
+        for (first, k) in (0..b.cols).step_by(PANEL).flat_map(|first| (0..blocks).map(move |k| (first, k))) {
+            let (inner, end) = (k * a.cols / blocks, (k + 1) * a.cols / blocks);
             let width = PANEL.min(b.cols - first);
-            panel.resize(inner.len(), Lane([0.0; PANEL]));
-            simd::transpose(isa, b.from(inner.start, first), b.col_stride, width, panel);
-            let residual = add || inner.start > 0;
-            let how = Finish { bias: &Lane([0.0; PANEL]), plus: None, activation: Activation::None, residual, width };
-            let ahead = parts(PANEL, PANEL.div_ceil(a.rows.div_ceil(GROUP)));
-            for (group, ahead) in parts(a.rows, GROUP).zip(ahead.map(Some).chain(std::iter::repeat(None))) {
-                // The next panel's columns come up from memory meanwhile.
-                for column in ahead.into_iter().flatten().map(|i| first + PANEL + i).filter(|&i| i < b.cols) {
-                    simd::prefetch(b.from(inner.start, column).get(..inner.len()).unwrap_or(&[]));
-                }
-                let tile = &mut tile[..group.len()];
-                simd::product(isa, a.from(group.start, inner.start), [a.row_stride, a.col_stride], panel, tile);
-                simd::finish(isa, tile, &how, &mut dst[group.start * stride + first..], stride);
-            }
+            panel.resize(end - inner, Lane([0.0; PANEL]));
+            simd::transpose(isa, b.from(inner, first), b.col_stride, width, panel);
+            let how = Finish { bias: &Lane([0.0; PANEL]), plus: None, activation: Activation::None, residual: add || k > 0, width };
+            let x = (a.from(0, inner), [a.row_stride, a.col_stride]);
+            simd::panel_rows(isa, a.rows, x, panel, &how, (&mut dst[first..], stride));
         }
     });
-}
-
-/// Ranges of nearly equal length that make up `0..all`, `most` at most; an empty one if there is nothing.
-fn parts(all: usize, most: usize) -> impl Iterator<Item = Range<usize>> {
-    let count = all.div_ceil(most).max(1);
-    (0..count).map(move |i| i * all / count..(i + 1) * all / count)
 }
 
 #[cfg(test)]

@@ -137,7 +137,7 @@ fn sigmoid(x: f32) -> f32 {
 ///
 /// # Panics
 /// If `x` is too short or no stride is 1.
-pub fn product(isa: Isa, x: &[f32], [row, input]: [usize; 2], panel: &[Lane], out: &mut [Lane]) {
+fn product(isa: Isa, x: &[f32], [row, input]: [usize; 2], panel: &[Lane], out: &mut [Lane]) {
     let Some((rows, inputs)) = out.len().checked_sub(1).zip(panel.len().checked_sub(1)) else {
         return out.fill(Lane([0.0; PANEL]));
     };
@@ -166,6 +166,7 @@ fn product_portable(x: &[f32], [row, input]: [usize; 2], panel: &[Lane], out: &m
 }
 
 /// How a tile's sums become outputs: f(sum + bias + plus), added to what is there if `residual`.
+#[derive(Clone, Copy)]
 pub struct Finish<'a> {
     pub bias: &'a Lane,
     /// Rows of `width` floats, and how far they lie apart.
@@ -180,7 +181,7 @@ pub struct Finish<'a> {
 ///
 /// # Panics
 /// If `y` or the rows to add are too short.
-pub fn finish(isa: Isa, tile: &mut [Lane], how: &Finish, y: &mut [f32], stride: usize) {
+fn finish(isa: Isa, tile: &mut [Lane], how: &Finish, y: &mut [f32], stride: usize) {
     let Some(last) = tile.len().checked_sub(1) else { return };
     assert!(how.width <= PANEL && y.len() >= last * stride + how.width);
     assert!(how.plus.is_none_or(|(rows, stride)| rows.len() >= last * stride + how.width));
@@ -219,15 +220,28 @@ pub fn transpose(isa: Isa, rows: &[f32], stride: usize, count: usize, panel: &mu
     }
 }
 
-/// Asks for `values` to be brought to the second-level cache.
-pub fn prefetch(values: &[f32]) {
-    #[cfg(target_arch = "x86_64")]
-    for line in values.chunks(16) {
-        // SAFETY: every x86-64 processor has this, and it reads nothing.
-        unsafe { std::arch::x86_64::_mm_prefetch::<{ std::arch::x86_64::_MM_HINT_T1 }>(line.as_ptr().cast()) };
+/// Outputs of one panel for `rows` rows: [`product`] and [`finish`], tile by tile. Inputs as for `product`, outputs as for `finish`.
+///
+/// # Panics
+/// If a slice is too short.
+pub fn panel_rows(
+    isa: Isa,
+    rows: usize,
+    (x, strides): (&[f32], [usize; 2]),
+    panel: &[Lane],
+    how: &Finish,
+    (y, stride): (&mut [f32], usize),
+) {
+    let groups = rows.div_ceil(GROUP);
+    let mut tile = [Lane([0.0; PANEL]); GROUP];
+    // Groups of nearly equal size: a last group of one row would waste most of the arithmetic units.
+    for g in 0..groups {
+        let (start, end) = (g * rows / groups, (g + 1) * rows / groups);
+        let tile = &mut tile[..end - start];
+        product(isa, x.get(start * strides[0]..).unwrap_or(&[]), strides, panel, tile);
+        let plus = how.plus.map(|(rows, stride)| (&rows[start * stride..], stride));
+        finish(isa, tile, &Finish { plus, ..*how }, &mut y[start * stride..], stride);
     }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = values;
 }
 
 #[cfg(test)]

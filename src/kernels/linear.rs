@@ -1,6 +1,6 @@
 //! Fully connected layers over packed weights.
 
-use super::simd::{self, Finish, Isa, Lane, PANEL};
+use super::simd::{self, Ahead, Finish, Isa, Lane, PANEL};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -134,11 +134,14 @@ impl Linear {
         if rows == 0 {
             return;
         }
-        for (p, (panel, bias)) in self.weight.chunks_exact(self.inputs).zip(&self.bias).enumerate() {
+        let mut panels = self.weight.chunks_exact(self.inputs);
+        for (p, bias) in self.bias.iter().enumerate() {
+            let Some(panel) = panels.next() else { break };
+            let ahead = Ahead::new(panels.clone().next().unwrap_or(&[]));
             let (first, width) = (p * PANEL, PANEL.min(self.outputs - p * PANEL));
             let plus = if let Source::Plus(v) = source { Some((&v.data[first..], v.stride)) } else { None };
             let how = Finish { bias, plus, activation, residual: matches!(source, Source::Residual), width };
-            simd::panel_rows(isa, rows, (x.data, [x.stride, 1]), panel, &how, (&mut y.data[first..], y.stride));
+            simd::panel_rows(isa, rows, (x.data, [x.stride, 1]), panel, ahead, &how, (&mut y.data[first..], y.stride));
         }
     }
 }

@@ -1,7 +1,7 @@
 //! General matrix products for training, where no operand is worth packing ahead.
 
 use super::Activation;
-use super::simd::{self, Finish, Isa, Lane, PANEL};
+use super::simd::{self, Ahead, Finish, Isa, Lane, PANEL};
 use gemm::Parallelism;
 use std::cell::RefCell;
 
@@ -60,7 +60,7 @@ pub fn product(a: Mat, b: Mat, dst: &mut [f32], stride: usize, add: bool) {
     }
     assert!(stride >= n && dst.len() >= (m - 1) * stride + n, "{m} x {n} at {stride} in {} floats", dst.len());
     if b.col_stride != 1 {
-        return by_panels(a, b, dst, stride, add);
+        return by_panels(a, b, dst, stride, &Ending { bias: &[], activation: Activation::None, add });
     }
     // SAFETY: all three matrices lie within their slices (checked above and when `a` and `b` were made); `dst` overlaps neither.
     unsafe {
@@ -88,9 +88,37 @@ pub fn product(a: Mat, b: Mat, dst: &mut [f32], stride: usize, add: bool) {
     }
 }
 
+/// `dst = f(x W^T + bias)`, rows without gaps. `x`: rows x inputs; `weight`: outputs x inputs; `bias`: outputs. One thread; always the
+/// same bits.
+///
+/// # Panics
+/// If the shapes do not fit.
+pub fn dense(x: Mat, weight: Mat, bias: &[f32], activation: Activation, dst: &mut [f32]) {
+    assert_eq!((x.cols, bias.len(), dst.len()), (weight.cols, weight.rows, x.rows * weight.rows), "inputs, outputs, rows x outputs");
+    // Sums of several blocks are whole only at the end.
+    let fused = if x.cols <= BLOCK { activation } else { Activation::None };
+    by_panels(x, weight.t(), dst, weight.rows, &Ending { bias, activation: fused, add: false });
+    if fused != activation {
+        activation.apply(dst);
+    }
+}
+
+/// What becomes of a product.
+struct Ending<'a> {
+    /// One per column, or none at all.
+    bias: &'a [f32],
+    /// Of sums of one block.
+    activation: Activation,
+    /// To what is there.
+    add: bool,
+}
+
 /// [`product`] with a transposed matrix: the library would gather its columns element by element, so they are turned here, a panel of
 /// them at a time, and meet all rows of `a` while they are in the cache.
-fn by_panels(a: Mat, b: Mat, dst: &mut [f32], stride: usize, add: bool) {
+fn by_panels(a: Mat, b: Mat, dst: &mut [f32], stride: usize, ending: &Ending) {
+    if a.rows == 0 {
+        return;
+    }
     let isa = Isa::best();
     // Blocks of nearly equal length; one of length 0 still writes its zeros.
     let blocks = a.cols.div_ceil(BLOCK).max(1);
@@ -100,9 +128,15 @@ fn by_panels(a: Mat, b: Mat, dst: &mut [f32], stride: usize, add: bool) {
             let width = PANEL.min(b.cols - first);
             panel.resize(end - inner, Lane([0.0; PANEL]));
             simd::transpose(isa, b.from(inner, first), b.col_stride, width, panel);
-            let how = Finish { bias: &Lane([0.0; PANEL]), plus: None, activation: Activation::None, residual: add || k > 0, width };
+            let mut bias = Lane([0.0; PANEL]);
+            if k == 0 && !ending.bias.is_empty() {
+                bias.0[..width].copy_from_slice(&ending.bias[first..first + width]);
+            }
+            let how = Finish { bias: &bias, plus: None, activation: ending.activation, residual: ending.add || k > 0, width };
             let x = (a.from(0, inner), [a.row_stride, a.col_stride]);
-            simd::panel_rows(isa, a.rows, x, panel, &how, (&mut dst[first..], stride));
+            let next = b.from(0, first + PANEL);
+            let ahead = Ahead::new(&next[..next.len().min(PANEL * b.col_stride)]);
+            simd::panel_rows(isa, a.rows, x, panel, ahead, &how, (&mut dst[first..], stride));
         }
     });
 }
@@ -163,6 +197,17 @@ mod tests {
         let (ones, mut dst) = (vec![1.0; n], [0.0; 1]);
         product(Mat::new(&ones, 1, n), Mat::new(&ones, 1, n).t(), &mut dst, 1, false);
         assert_eq!(dst, [n as f32]);
+        dense(Mat::new(&ones, 1, n), Mat::new(&ones, 1, n), &[-4.0 - n as f32], Activation::LeakyRelu(0.5), &mut dst);
+        assert_eq!(dst, [-2.0]);
+    }
+
+    /// x W^T = (3 7 -11; 2 4 -6).
+    #[test]
+    fn layers_by_hand() {
+        let (x, weight, mut y) = ([1.0, 1.0, 0.0, 1.0], [1.0, 2.0, 3.0, 4.0, -5.0, -6.0], [9.0; 6]);
+        dense(Mat::new(&x, 2, 2), Mat::new(&weight, 3, 2), &[-10.0, 0.0, 10.0], Activation::Relu, &mut y);
+        assert_eq!(y, [0.0, 7.0, 0.0, 0.0, 4.0, 4.0]);
+        dense(Mat::new(&[], 0, 2), Mat::new(&weight, 3, 2), &[0.0; 3], Activation::None, &mut []);
     }
 
     #[test]

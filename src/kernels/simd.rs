@@ -132,12 +132,33 @@ fn sigmoid(x: f32) -> f32 {
     tanh(0.5 * x).mul_add(0.5, 0.5)
 }
 
+/// Memory that is wanted soon. It is fetched into the second-level cache while tiles are worked on, since weights come from further away
+/// than a tile can wait for.
+#[derive(Clone, Copy)]
+pub struct Ahead {
+    /// Where it lies; only asked for, never read.
+    pub start: *const u8,
+    pub bytes: usize,
+}
+
+impl Ahead {
+    pub fn new<T>(memory: &[T]) -> Self {
+        Self { start: memory.as_ptr().cast(), bytes: size_of_val(memory) }
+    }
+
+    /// The k-th of `n` equal parts.
+    fn part(self, k: usize, n: usize) -> Self {
+        let bytes = self.bytes / n;
+        Self { start: self.start.wrapping_add(k * bytes), bytes }
+    }
+}
+
 /// `out[r] = x[r] W` for `out.len()` rows (at most `GROUP`); `panel` has one lane per input. Input k of row r is
 /// `x[r * row + k * input]`, and one of the strides `[row, input]` is 1.
 ///
 /// # Panics
 /// If `x` is too short or no stride is 1.
-fn product(isa: Isa, x: &[f32], [row, input]: [usize; 2], panel: &[Lane], out: &mut [Lane]) {
+fn product(isa: Isa, x: &[f32], [row, input]: [usize; 2], panel: &[Lane], ahead: Ahead, out: &mut [Lane]) {
     let Some((rows, inputs)) = out.len().checked_sub(1).zip(panel.len().checked_sub(1)) else {
         return out.fill(Lane([0.0; PANEL]));
     };
@@ -145,7 +166,7 @@ fn product(isa: Isa, x: &[f32], [row, input]: [usize; 2], panel: &[Lane], out: &
     match isa {
         // SAFETY: the processor has the features; the length of `x` was checked.
         #[cfg(target_arch = "x86_64")]
-        Isa::Avx512 => unsafe { x86::product_512(x.as_ptr(), [row, input], panel, out) },
+        Isa::Avx512 => unsafe { x86::product_512(x.as_ptr(), [row, input], panel, ahead, out) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Isa::Avx2 => unsafe { x86::product_256(x.as_ptr(), [row, input], panel, out) },
@@ -220,7 +241,8 @@ pub fn transpose(isa: Isa, rows: &[f32], stride: usize, count: usize, panel: &mu
     }
 }
 
-/// Outputs of one panel for `rows` rows: [`product`] and [`finish`], tile by tile. Inputs as for `product`, outputs as for `finish`.
+/// Outputs of one panel for `rows` rows: [`product`] and [`finish`], tile by tile. Inputs as for `product`, outputs as for `finish`;
+/// meanwhile `ahead` is fetched.
 ///
 /// # Panics
 /// If a slice is too short.
@@ -229,6 +251,7 @@ pub fn panel_rows(
     rows: usize,
     (x, strides): (&[f32], [usize; 2]),
     panel: &[Lane],
+    ahead: Ahead,
     how: &Finish,
     (y, stride): (&mut [f32], usize),
 ) {
@@ -238,7 +261,7 @@ pub fn panel_rows(
     for g in 0..groups {
         let (start, end) = (g * rows / groups, (g + 1) * rows / groups);
         let tile = &mut tile[..end - start];
-        product(isa, x.get(start * strides[0]..).unwrap_or(&[]), strides, panel, tile);
+        product(isa, x.get(start * strides[0]..).unwrap_or(&[]), strides, panel, ahead.part(g, groups), tile);
         let plus = how.plus.map(|(rows, stride)| (&rows[start * stride..], stride));
         finish(isa, tile, &Finish { plus, ..*how }, &mut y[start * stride..], stride);
     }
@@ -282,7 +305,7 @@ mod tests {
             // Rows apart, and rows side by side.
             for (strides, rows) in [[40, 1], [1, 40]].into_iter().flat_map(|s| (0..=GROUP).map(move |n| (s, n))) {
                 let (mut out, mut want) = (vec![Lane([9.0; PANEL]); rows], vec![Lane([9.0; PANEL]); rows]);
-                product(isa, &data, strides, &panel, &mut out);
+                product(isa, &data, strides, &panel, Ahead::new(&data), &mut out);
                 product_portable(&data, strides, &panel, &mut want);
                 assert!(out.iter().zip(&want).all(|(a, b)| a.0 == b.0), "{isa:?} {rows} rows at {strides:?}");
             }

@@ -1,17 +1,17 @@
 //! Loops written with intrinsics.
 
 use super::linear::Activation;
-use super::simd::{Finish, Lane, TANH_END, TANH_P, TANH_Q};
+use super::simd::{Ahead, Finish, Lane, TANH_END, TANH_P, TANH_Q};
 use std::arch::x86_64::*;
 
 /// # Safety
 /// The processor has AVX-512F; `out` has at most 12 rows; `x` holds every input of them at the strides (row, input), one of which is 1.
 #[target_feature(enable = "avx512f")]
-pub unsafe fn product_512(x: *const f32, [row, input]: [usize; 2], panel: &[Lane], out: &mut [Lane]) {
+pub unsafe fn product_512(x: *const f32, [row, input]: [usize; 2], panel: &[Lane], ahead: Ahead, out: &mut [Lane]) {
     macro_rules! rows {
         ($across:literal, $stride:expr, $($n:literal)*) => {
             // SAFETY: the caller's promise, with exactly `$n` rows.
-            match out.len() { $($n => unsafe { tile_512::<$n, $across>(x, $stride, panel, out) },)* _ => {} }
+            match out.len() { $($n => unsafe { tile_512::<$n, $across>(x, $stride, panel, ahead, out) },)* _ => {} }
         };
     }
     match input {
@@ -23,31 +23,40 @@ pub unsafe fn product_512(x: *const f32, [row, input]: [usize; 2], panel: &[Lane
 /// # Safety
 /// As `product_512`; `out` has `R` rows. `stride` is that of the rows, or of the inputs if `ACROSS`; the other one is 1.
 #[target_feature(enable = "avx512f")]
-unsafe fn tile_512<const R: usize, const ACROSS: bool>(x: *const f32, stride: usize, panel: &[Lane], out: &mut [Lane]) {
+unsafe fn tile_512<const R: usize, const ACROSS: bool>(x: *const f32, stride: usize, panel: &[Lane], ahead: Ahead, out: &mut [Lane]) {
+    let (row, input) = if ACROSS { (1, stride) } else { (stride, 1) };
     let mut sum = [[_mm512_setzero_ps(); 2]; R];
+    // Every third row, hidden from the compiler, which would work out all rows' addresses from the first one each time and run short of
+    // registers: the processor adds none, one or two rows while it loads.
+    let mut thirds: [_; 4] = std::array::from_fn(|i| std::hint::black_box(x.wrapping_add(3 * i * row)));
     macro_rules! add {
         ($k:expr, $lane:expr) => {
             // SAFETY: a lane is 32 floats on a cache line; row and input are within `x`.
             unsafe {
                 let w = [_mm512_load_ps($lane.0.as_ptr()), _mm512_load_ps($lane.0.as_ptr().add(16))];
-                for (row, sum) in sum.iter_mut().enumerate() {
-                    let v = _mm512_set1_ps(*x.add(if ACROSS { $k * stride + row } else { row * stride + $k }));
+                for (r, sum) in sum.iter_mut().enumerate() {
+                    let v = _mm512_set1_ps(*thirds[r / 3].add(r % 3 * row + $k * input));
                     sum[0] = _mm512_fmadd_ps(v, w[0], sum[0]);
                     sum[1] = _mm512_fmadd_ps(v, w[1], sum[1]);
                 }
             }
         };
     }
-    // Four inputs share the arithmetic on addresses, which would otherwise keep the multipliers waiting.
     let (fours, rest) = panel.as_chunks::<4>();
-    for (k, four) in fours.iter().enumerate() {
-        add!(4 * k, four[0]);
-        add!(4 * k + 1, four[1]);
-        add!(4 * k + 2, four[2]);
-        add!(4 * k + 3, four[3]);
+    let (mut at, step) = (ahead.start, ahead.bytes / (2 * fours.len()).max(1));
+    for four in fours {
+        // Four inputs share the arithmetic on addresses, which would otherwise keep the multipliers waiting.
+        _mm_prefetch::<_MM_HINT_T1>(at.cast());
+        add!(0, four[0]);
+        add!(1, four[1]);
+        _mm_prefetch::<_MM_HINT_T1>(at.wrapping_add(step).cast());
+        add!(2, four[2]);
+        add!(3, four[3]);
+        at = at.wrapping_add(2 * step);
+        thirds = thirds.map(|x| x.wrapping_add(4 * input));
     }
     for (k, lane) in rest.iter().enumerate() {
-        add!(4 * fours.len() + k, lane);
+        add!(k, lane);
     }
     for (sum, out) in sum.iter().zip(out) {
         // SAFETY: as above.

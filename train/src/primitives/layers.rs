@@ -4,7 +4,7 @@
 //! less work than an autodiff graph over the frames, which the tests compare with.
 
 use egogen::Result;
-use egogen::kernels::{Activation, Linear, Mat, Source, View, ViewMut, product};
+use egogen::kernels::{self, Activation, Linear, Mat, Source, View, ViewMut, product};
 use egogen::motion::{Dense, Gru};
 
 /// Applies tanh to every value.
@@ -45,8 +45,8 @@ pub fn dense(layer: &Dense, x: &[f32], y: &mut Vec<f32>) {
 /// y = x W^T + b into `y`.
 pub fn dense_into(layer: &Dense, x: &[f32], y: &mut [f32]) {
     let rows = x.len() / layer.input;
-    fill_rows(&layer.bias, y);
-    product(Mat::new(x, rows, layer.input), Mat::new(&layer.weight, layer.output, layer.input).t(), y, layer.output, true);
+    let weight = Mat::new(&layer.weight, layer.output, layer.input);
+    kernels::dense(Mat::new(x, rows, layer.input), weight, &layer.bias, Activation::None, y);
 }
 
 /// dx = dy W, or dx += dy W if `add`.
@@ -204,9 +204,8 @@ impl GruTape {
         let (h, steps) = (gru.hidden, x.len() / (rows * gru.input));
         self.reset(h, rows, steps);
         self.states[..rows * h].fill(0.0);
-        fill_rows(&gru.bias_ih, &mut self.input);
-        let weight = Mat::new(&gru.weight_ih, 3 * h, gru.input).t();
-        product(Mat::new(x, steps * rows, gru.input), weight, &mut self.input, 3 * h, true);
+        let weight = Mat::new(&gru.weight_ih, 3 * h, gru.input);
+        kernels::dense(Mat::new(x, steps * rows, gru.input), weight, &gru.bias_ih, Activation::None, &mut self.input);
         for t in 0..steps {
             self.step(packed, rows, t);
         }

@@ -38,7 +38,6 @@ pub mod tensorboard;
 pub mod trainer;
 
 pub use acts::Acts;
-pub use backward::Tape;
 pub use collector::{Collector, Episode, Rollout, test_episodes};
 pub use error::{Error, Result};
 pub use gae::{Steps, gae};

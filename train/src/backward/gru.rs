@@ -20,21 +20,20 @@ impl Gru {
     pub fn of(spec: &PolicySpec, flat: &[f32], encoder: &Encoder, obs: &[f32]) -> Option<Self> {
         let Part::Gru { frames, width, ih, hh } = encoder.part else { return None };
         let dim = spec.layout.dim();
-        let frame = |t: usize| {
-            let at = encoder.start + t * width;
-            obs.chunks_exact(dim).flat_map(move |row| &row[at..at + width])
-        };
-        let x: Vec<f32> = (0..frames).flat_map(frame).copied().collect();
         let (rows, hidden) = (obs.len() / dim, encoder.output);
+        let mut x = Vec::with_capacity(frames * rows * width);
+        for at in (0..frames).map(|t| encoder.start + t * width) {
+            obs.chunks_exact(dim).for_each(|row| x.extend_from_slice(&row[at..at + width]));
+        }
         let n = rows * hidden;
-        let input = dense(&spec.layers[ih], flat, &x);
+        let input = dense(&spec.layers[ih], flat, &x, Activation::None);
         let mut gru = Self { rows, hidden, x, gates: vec![0.0; frames * 4 * n], states: vec![0.0; frames * n] };
         for t in 0..frames {
             let (past, states) = gru.states.split_at_mut(t * n);
             // The first state is zero: its share is the bias alone.
             let (before, share) = match t {
                 0 => (vec![0.0; n], spec.layers[hh].bias_of(flat).repeat(rows)),
-                _ => (past[(t - 1) * n..].to_vec(), dense(&spec.layers[hh], flat, &past[(t - 1) * n..])),
+                _ => (past[(t - 1) * n..].to_vec(), dense(&spec.layers[hh], flat, &past[(t - 1) * n..], Activation::None)),
             };
             let people = input[t * 3 * n..].chunks_exact(3 * hidden).zip(share.chunks_exact(3 * hidden));
             let states = before.chunks_exact(hidden).zip(states.chunks_exact_mut(hidden));

@@ -19,8 +19,7 @@ impl Chain {
         };
         let mut inputs = vec![];
         for &layer in layers {
-            let mut next = dense(&spec.layers[layer], flat, &h);
-            activation.apply(&mut next);
+            let next = dense(&spec.layers[layer], flat, &h, activation);
             inputs.push(std::mem::replace(&mut h, next));
         }
         (Self { inputs }, h)
@@ -44,16 +43,18 @@ impl Chain {
 }
 
 /// Activations of an actor or critic: residual blocks or plain layers, then the output layer.
-pub(super) struct Head {
+pub struct Head {
     plain: Chain,
     /// rows x W: the input of each block, then that of the output layer.
     inputs: Vec<Vec<f32>>,
     /// rows x W: both layers of each block, after the leaky ReLU.
     inner: Vec<[Vec<f32>; 2]>,
+    /// rows x outputs: means and log variances before the clamp, means alone, logits, or the value.
     pub out: Vec<f32>,
 }
 
 impl Head {
+    /// Runs the head's `layers` with parameters `flat` on rows of the trunk.
     pub fn forward(spec: &PolicySpec, flat: &[f32], layers: &[usize], trunk: Vec<f32>) -> Self {
         let (inner, last) = layers.split_at(layers.len() - 1);
         let (blocks, plain) = if spec.config.hidden.is_empty() { (inner, &[][..]) } else { (&[][..], inner) };
@@ -61,17 +62,17 @@ impl Head {
         let (mut inputs, mut inner) = (vec![trunk], vec![]);
         for pair in blocks.chunks_exact(2) {
             let h = &inputs[inputs.len() - 1];
-            let first = leaky(dense(&spec.layers[pair[0]], flat, h));
-            let second = leaky(dense(&spec.layers[pair[1]], flat, &first));
+            let first = dense(&spec.layers[pair[0]], flat, h, Activation::LeakyRelu(SLOPE));
+            let second = dense(&spec.layers[pair[1]], flat, &first, Activation::LeakyRelu(SLOPE));
             let next = h.iter().zip(&second).map(|(h, s)| h + s).collect();
             inputs.push(next);
             inner.push([first, second]);
         }
-        let out = dense(&spec.layers[last[0]], flat, &inputs[inputs.len() - 1]);
+        let out = dense(&spec.layers[last[0]], flat, &inputs[inputs.len() - 1], Activation::None);
         Self { plain, inputs, inner, out }
     }
 
-    /// What the output layer sees.
+    /// rows x `spec.latent()`: what the output layer sees.
     pub fn latent(&self) -> &[f32] {
         &self.inputs[self.inputs.len() - 1]
     }
@@ -87,10 +88,9 @@ impl Head {
         out.push(Delta { layer: last[0], x, dy });
         for ((pair, h), [first, second]) in blocks.chunks_exact(2).zip(self.inputs).zip(self.inner).rev() {
             let (a, b) = (&spec.layers[pair[0]], &spec.layers[pair[1]]);
-            let mut inner = d.clone();
-            leaky_back(&second, &mut inner);
+            let inner: Vec<f32> = d.iter().zip(&second).map(|(d, &y)| leaky_back(y, *d)).collect();
             let mut outer = dense_back(b, flat, &inner);
-            leaky_back(&first, &mut outer);
+            outer.iter_mut().zip(&first).for_each(|(d, &y)| *d = leaky_back(y, *d));
             product(rows_of(&outer, a.output), weight(a, flat), &mut d, a.input, true);
             out.push(Delta { layer: pair[1], x: first, dy: inner });
             out.push(Delta { layer: pair[0], x: h, dy: outer });
@@ -99,12 +99,7 @@ impl Head {
     }
 }
 
-fn leaky(mut x: Vec<f32>) -> Vec<f32> {
-    x.iter_mut().for_each(|v| *v = v.max(SLOPE * *v));
-    x
-}
-
-/// From gradients of the activations `y` to those of their inputs; y has the sign of its input.
-fn leaky_back(y: &[f32], d: &mut [f32]) {
-    d.iter_mut().zip(y).for_each(|(d, &y)| *d *= if y > 0.0 { 1.0 } else { SLOPE });
+/// From the gradient of an activation `y` to that of its input, which has its sign.
+fn leaky_back(y: f32, d: f32) -> f32 {
+    if y > 0.0 { d } else { SLOPE * d }
 }

@@ -4,11 +4,11 @@
 mod gru;
 mod head;
 
-use crate::primitives::layers::fill_rows;
 use egogen::agent::{Dense, Encoder, Part, PolicySpec};
-use egogen::kernels::{Mat, product};
+use egogen::kernels::{self, Activation, Mat, product};
 use gru::Gru;
-use head::{Chain, Head};
+use head::Chain;
+pub use head::Head;
 use rayon::prelude::*;
 
 /// Outputs of a layer whose weights one thread works on at a time.
@@ -16,22 +16,21 @@ const OUTPUTS: usize = 192;
 /// Products smaller than this, multiplications, are not worth a second thread.
 const SMALL: usize = 1 << 21;
 
-/// What the network said of some observations, and all that its backward pass needs.
-pub struct Tape<'a> {
+/// What both heads see of some people, and all that its backward pass needs.
+pub struct Stem<'a> {
     spec: &'a PolicySpec,
     flat: &'a [f32],
     /// One per encoder; `None` where it is no GRU.
     grus: Vec<Option<Gru>>,
+    /// rows x E: what the projection saw, if there is one.
     encoded: Vec<f32>,
     shared: Chain,
-    /// rows x W: what the heads see.
-    trunk: Vec<f32>,
-    actor: Head,
-    critic: Head,
+    /// rows x W.
+    pub trunk: Vec<f32>,
 }
 
-impl<'a> Tape<'a> {
-    /// Runs the network with parameters `flat` on observation rows (n x layout.dim()).
+impl<'a> Stem<'a> {
+    /// Runs the encoders with parameters `flat` on observation rows (n x layout.dim()).
     pub fn forward(spec: &'a PolicySpec, flat: &'a [f32], obs: &[f32]) -> Self {
         let (dim, width) = (spec.layout.dim(), spec.encoded());
         let rows = obs.len() / dim;
@@ -49,37 +48,17 @@ impl<'a> Tape<'a> {
             at += encoder.output;
         }
         let trunk = match spec.project {
-            Some(i) => dense(&spec.layers[i], flat, &encoded),
-            None => encoded.clone(),
+            Some(i) => dense(&spec.layers[i], flat, &encoded, Activation::None),
+            None => std::mem::take(&mut encoded),
         };
         let (shared, trunk) = Chain::forward(spec, flat, &spec.shared, trunk);
-        let head = |layers: &[usize]| Head::forward(spec, flat, layers, trunk.clone());
-        let (actor, critic) = (head(&spec.actor), head(&spec.critic));
-        Self { spec, flat, grus, encoded, shared, trunk, actor, critic }
+        Self { spec, flat, grus, encoded, shared, trunk }
     }
 
-    /// rows x `spec.outputs()`: means and log variances before the clamp, means alone, or logits.
-    pub fn action(&self) -> &[f32] {
-        &self.actor.out
-    }
-
-    /// rows x `spec.latent()`: the actor's last hidden activations.
-    pub fn latent(&self) -> &[f32] {
-        self.actor.latent()
-    }
-
-    /// rows values.
-    pub fn value(&self) -> &[f32] {
-        &self.critic.out
-    }
-
-    /// What every layer learns from gradients of [`Tape::action`] and [`Tape::value`].
-    pub fn backward(self, action: Vec<f32>, value: Vec<f32>) -> Vec<Delta> {
+    /// What every layer learns from the gradient of [`Stem::trunk`].
+    pub fn backward(self, d: Vec<f32>) -> Vec<Delta> {
         let (spec, flat, mut out) = (self.spec, self.flat, vec![]);
-        let mut d = self.actor.backward(spec, flat, &spec.actor, action, &mut out);
-        let critic = self.critic.backward(spec, flat, &spec.critic, value, &mut out);
-        d.iter_mut().zip(critic).for_each(|(a, c)| *a += c);
-        d = self.shared.backward(spec, flat, &spec.shared, &self.trunk, d, &mut out);
+        let mut d = self.shared.backward(spec, flat, &spec.shared, &self.trunk, d, &mut out);
         if let Some(layer) = spec.project {
             let before = dense_back(&spec.layers[layer], flat, &d);
             out.push(Delta { layer, x: self.encoded, dy: std::mem::replace(&mut d, before) });
@@ -87,8 +66,9 @@ impl<'a> Tape<'a> {
         let mut at = 0;
         for (encoder, gru) in spec.encoders.iter().zip(self.grus) {
             if let (Some(gru), Part::Gru { ih, hh, .. }) = (gru, &encoder.part) {
-                let columns = d.chunks_exact(spec.encoded()).flat_map(|row| &row[at..at + encoder.output]);
-                out.extend(gru.backward(spec, flat, [*ih, *hh], columns.copied().collect()));
+                let mut columns = Vec::with_capacity(d.len() / spec.encoded() * encoder.output);
+                d.chunks_exact(spec.encoded()).for_each(|row| columns.extend_from_slice(&row[at..at + encoder.output]));
+                out.extend(gru.backward(spec, flat, [*ih, *hh], columns));
             }
             at += encoder.output;
         }
@@ -105,10 +85,10 @@ pub struct Delta {
     dy: Vec<f32>,
 }
 
-/// Writes the gradients of all layers' weights and biases to `grads`, in the flat layout: the sums over `parts`, pieces of one batch.
+/// Writes the gradients of all layers' weights and biases to `grads`, in the flat layout: the sums over `deltas` of a batch of `rows`.
 ///
-/// Every number is summed by one thread over the parts in their order.
-pub fn weigh(spec: &PolicySpec, parts: &[Vec<Delta>], grads: &mut [f32]) {
+/// Every number is summed by one thread over the deltas in their order.
+pub fn weigh(spec: &PolicySpec, rows: usize, deltas: &[Delta], grads: &mut [f32]) {
     let (mut pieces, mut rest, mut at) = (vec![], grads, 0);
     for (i, layer) in spec.layers.iter().enumerate() {
         let (own, behind) = rest[layer.offset - at..].split_at_mut(layer.params());
@@ -118,7 +98,7 @@ pub fn weigh(spec: &PolicySpec, parts: &[Vec<Delta>], grads: &mut [f32]) {
         pieces.extend(chunks.enumerate().map(|(k, (weight, bias))| (i, k * OUTPUTS, weight, bias)));
     }
     let work = |(i, first, weight, bias): (usize, usize, &mut [f32], &mut [f32])| {
-        let (layer, seen) = (&spec.layers[i], parts.iter().flatten().filter(|d| d.layer == i));
+        let (layer, seen) = (&spec.layers[i], deltas.iter().filter(|d| d.layer == i));
         bias.fill(0.0);
         for (k, delta) in seen.enumerate() {
             weigh_piece(layer, first, delta, weight, k > 0);
@@ -127,7 +107,6 @@ pub fn weigh(spec: &PolicySpec, parts: &[Vec<Delta>], grads: &mut [f32]) {
             }
         }
     };
-    let rows: usize = parts.iter().flat_map(|p| p.first()).map(|d| d.dy.len() / spec.layers[d.layer].output).sum();
     match rows * spec.params() < SMALL {
         true => pieces.into_iter().for_each(work),
         false => pieces.into_par_iter().for_each(work),
@@ -167,11 +146,10 @@ fn weight<'a>(layer: &Dense, flat: &'a [f32]) -> Mat<'a> {
     Mat::new(layer.weight_of(flat), layer.output, layer.input)
 }
 
-/// y = x W^T + b.
-fn dense(layer: &Dense, flat: &[f32], x: &[f32]) -> Vec<f32> {
+/// y = f(x W^T + b).
+fn dense(layer: &Dense, flat: &[f32], x: &[f32], activation: Activation) -> Vec<f32> {
     let mut y = vec![0.0; x.len() / layer.input * layer.output];
-    fill_rows(layer.bias_of(flat), &mut y);
-    product(rows_of(x, layer.input), weight(layer, flat).t(), &mut y, layer.output, true);
+    kernels::dense(rows_of(x, layer.input), weight(layer, flat), layer.bias_of(flat), activation, &mut y);
     y
 }
 

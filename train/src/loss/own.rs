@@ -2,15 +2,25 @@
 
 use super::{Batch, Losses};
 use crate::PpoConfig;
-use crate::backward::{Delta, Tape, weigh};
+use crate::backward::{Delta, Head, Stem, weigh};
 use crate::ppo::PriorForm;
 use egogen::agent::{ActionSpace, PolicySpec, log_prob_of, log_softmax_of, state_logvar};
 use rayon::prelude::*;
 use std::f64::consts::TAU;
 use std::ops::Range;
 
-/// What a shard leaves: what its layers learn from, the gradient of what the log standard deviations give, and its share of the figures.
-type Part = (Vec<Delta>, Vec<f32>, Losses, f64);
+/// What some people leave in one of the heads.
+#[derive(Default)]
+struct Part {
+    /// rows x W: the gradient of the trunk.
+    d: Vec<f32>,
+    deltas: Vec<Delta>,
+    /// The gradient of what log standard deviations give that are parameters.
+    d_free: Vec<f32>,
+    losses: Losses,
+    /// Largest |ratio - 1|.
+    ratio_error: f64,
+}
 
 /// The minibatch's loss with gradients by hand, which are written to `grads`. `shards` are ranges of its rows, each for one thread.
 pub(super) fn learn(
@@ -21,67 +31,96 @@ pub(super) fn learn(
     ppo: &PpoConfig,
     grads: &mut [f32],
 ) -> (Losses, f64) {
-    let work = |rows| shard(spec, params, batch, rows, ppo);
-    let parts: Vec<Part> = match shards.len() {
-        // The way to another thread takes longer than a small network.
-        1 => shards.into_iter().map(work).collect(),
-        _ => shards.into_par_iter().map(work).collect(),
-    };
+    let (dim, count, parallel) = (spec.layout.dim(), batch.returns.len(), shards.len() > 1);
+    let stems = each(parallel, shards.clone(), |rows| Stem::forward(spec, params, &batch.obs[rows.start * dim..rows.end * dim]));
+    let trunk = stems.iter().map(|s| &*s.trunk).collect::<Vec<_>>().concat();
+    let width = trunk.len() / count.max(1);
+    // A head's layers meet all people at once if there are two threads: reading and packing weights costs much beside their products.
+    let blocks = shards.len().div_ceil(2);
+    let rows = |k: usize| (k % blocks) * count / blocks..(k % blocks + 1) * count / blocks;
+    let heads = each(parallel, (0..2 * blocks).collect(), |k: usize| {
+        let (rows, trunk) = (rows(k), trunk[rows(k).start * width..rows(k).end * width].to_vec());
+        if k < blocks { actor(spec, params, batch, rows, trunk, ppo) } else { critic(spec, params, batch, rows, trunk, ppo) }
+    });
+    let join = |parts: &[Part]| parts.iter().map(|p| &*p.d).collect::<Vec<_>>().concat();
+    let d = [join(&heads[..blocks]), join(&heads[blocks..])];
+    let stems = each(parallel, stems.into_iter().zip(shards).collect(), |(stem, rows): (Stem, Range<usize>)| {
+        let [actor, critic] = d.each_ref().map(|d| &d[rows.start * width..rows.end * width]);
+        stem.backward(actor.iter().zip(critic).map(|(a, c)| a + c).collect())
+    });
     let (mut losses, mut ratio_error, mut deltas) = (Losses::default(), 0.0f64, vec![]);
     let log_std = spec.log_std_range();
     grads[log_std.clone()].fill(0.0);
-    for (delta, d_free, part, error) in parts {
-        losses.add(&part, 1.0);
-        ratio_error = ratio_error.max(error);
-        grads[log_std.clone()].iter_mut().zip(d_free).for_each(|(g, d)| *g += 2.0 * d);
-        deltas.push(delta);
+    for part in heads {
+        losses.add(&part.losses, 1.0);
+        ratio_error = ratio_error.max(part.ratio_error);
+        grads[log_std.clone()].iter_mut().zip(part.d_free).for_each(|(g, d)| *g += 2.0 * d);
+        deltas.extend(part.deltas);
     }
-    weigh(spec, &deltas, grads);
+    deltas.extend(stems.into_iter().flatten());
+    weigh(spec, count, &deltas, grads);
     (losses, ratio_error)
 }
 
-/// One shard's share.
-fn shard(spec: &PolicySpec, params: &[f32], batch: &Batch, rows: Range<usize>, ppo: &PpoConfig) -> Part {
-    let (dim, width, outputs) = (spec.layout.dim(), spec.action.width(), spec.outputs());
+/// `work` on all `items`, side by side if `parallel`: the way to another thread takes longer than a small network. Results in order.
+fn each<T: Send, U: Send>(parallel: bool, items: Vec<T>, work: impl Fn(T) -> U + Sync + Send) -> Vec<U> {
+    if parallel { items.into_par_iter().map(work).collect() } else { items.into_iter().map(work).collect() }
+}
+
+/// The policy's share of the loss of some rows.
+fn actor(spec: &PolicySpec, params: &[f32], batch: &Batch, rows: Range<usize>, trunk: Vec<f32>, ppo: &PpoConfig) -> Part {
+    let (width, outputs) = (spec.action.width(), spec.outputs());
     let count = batch.returns.len() as f32;
-    let tape = Tape::forward(spec, params, &batch.obs[rows.start * dim..rows.end * dim]);
+    let head = Head::forward(spec, params, &spec.actor, trunk);
     let mut d_action = vec![0.0; rows.len() * outputs];
-    let mut d_value = Vec::with_capacity(rows.len());
-    let (mut losses, mut ratio_error) = (Losses::default(), 0.0f64);
     // Log variances that the network does not give, before the clamp: their gradient in a row, and that of what they come from in all.
     let (noise, log_std) = (spec.noise_variances(params), &params[spec.log_std_range()]);
     let mut free: Vec<f32> = log_std.iter().take(width).map(|s| 2.0 * s).collect();
-    let (mut d_row, mut d_free) = (free.clone(), vec![0.0; log_std.len()]);
-    let said = tape.action().chunks_exact(outputs).zip(tape.value()).zip(tape.latent().chunks_exact(spec.latent()));
-    for ((i, ((out, &value), latent)), d) in rows.zip(said).zip(d_action.chunks_exact_mut(outputs)) {
-        let (error, moves) = value_error(value, batch.old_value[i], batch.returns[i], ppo);
-        losses.value += error * error / f64::from(count);
-        d_value.push(if moves { ppo.value * 2.0 * error as f32 / count } else { 0.0 });
+    let mut d_row = free.clone();
+    let mut part = Part { d_free: vec![0.0; log_std.len()], ..Part::default() };
+    let said = head.out.chunks_exact(outputs).zip(head.latent().chunks_exact(spec.latent()));
+    for ((i, (out, latent)), d) in rows.zip(said).zip(d_action.chunks_exact_mut(outputs)) {
         let action = &batch.actions[i * width..(i + 1) * width];
         let row = Row { action, old_log_prob: batch.old_log_prob[i], advantage: batch.advantage[i], ppo, count };
         let beyond = match spec.action {
-            ActionSpace::Discrete(_) => row.choice(out, d, &mut losses),
+            ActionSpace::Discrete(_) => row.choice(out, d, &mut part.losses),
             ActionSpace::Continuous(_) if free.is_empty() => {
                 let (out, d) = (out.split_at(width), d.split_at_mut(width));
-                row.gaussian(out, spec.config.logvar, d, &mut losses)
+                row.gaussian(out, spec.config.logvar, d, &mut part.losses)
             }
             ActionSpace::Continuous(_) if !noise.is_empty() => {
                 state_logvar(latent, &noise, &mut free);
-                let beyond = row.gaussian((out, &free), [f32::NEG_INFINITY, f32::INFINITY], (d, &mut d_row), &mut losses);
-                for ((h, v), sum) in latent.iter().zip(noise.chunks_exact(width)).zip(d_free.chunks_exact_mut(width)) {
+                let beyond = row.gaussian((out, &free), [f32::NEG_INFINITY, f32::INFINITY], (d, &mut d_row), &mut part.losses);
+                for ((h, v), sum) in latent.iter().zip(noise.chunks_exact(width)).zip(part.d_free.chunks_exact_mut(width)) {
                     (0..width).for_each(|k| sum[k] += d_row[k] * h * h * v[k] * (-free[k]).exp());
                 }
                 beyond
             }
             ActionSpace::Continuous(_) => {
-                let beyond = row.gaussian((out, &free), spec.config.logvar, (d, &mut d_row), &mut losses);
-                d_free.iter_mut().zip(&d_row).for_each(|(sum, d)| *sum += d);
+                let beyond = row.gaussian((out, &free), spec.config.logvar, (d, &mut d_row), &mut part.losses);
+                part.d_free.iter_mut().zip(&d_row).for_each(|(sum, d)| *sum += d);
                 beyond
             }
         };
-        ratio_error = ratio_error.max(beyond.abs());
+        part.ratio_error = part.ratio_error.max(beyond.abs());
     }
-    (tape.backward(d_action, d_value), d_free, losses, ratio_error)
+    part.d = head.backward(spec, params, &spec.actor, d_action, &mut part.deltas);
+    part
+}
+
+/// The value's share of the loss of some rows.
+fn critic(spec: &PolicySpec, params: &[f32], batch: &Batch, rows: Range<usize>, trunk: Vec<f32>, ppo: &PpoConfig) -> Part {
+    let count = batch.returns.len() as f32;
+    let head = Head::forward(spec, params, &spec.critic, trunk);
+    let mut part = Part::default();
+    let d_value = rows.zip(&head.out).map(|(i, &value)| {
+        let (error, moves) = value_error(value, batch.old_value[i], batch.returns[i], ppo);
+        part.losses.value += error * error / f64::from(count);
+        if moves { ppo.value * 2.0 * error as f32 / count } else { 0.0 }
+    });
+    let d_value = d_value.collect();
+    part.d = head.backward(spec, params, &spec.critic, d_value, &mut part.deltas);
+    part
 }
 
 /// The error that counts, and whether it moves with the value. With `value_clip` the value may leave the old one by at most the clip

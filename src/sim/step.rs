@@ -88,9 +88,10 @@ impl Sim {
             return Err(Error::invalid(format!("{} latent floats for {n} people, expected {n} x {dim}", latents.len())));
         }
         all_finite("latents", latents, dim)?;
+        let bodies: Vec<_> = people.betas.par_chunks_exact(BETAS).with_min_len(CHUNK).map(|betas| self.body.shape(betas)).collect();
         let mut buffers = self.spare.lock().map(|mut s| s.pop().unwrap_or_default()).unwrap_or_default();
         let done = self.predict(people, latents, &mut buffers).and_then(|()| {
-            self.fill(people, &buffers, out);
+            self.fill(people, &bodies, &buffers, out);
             all_finite("markers", &out.markers, FRAMES * MARKER_DIM)?;
             all_finite("bodies", &out.params, FRAMES * PARAMS)?;
             all_finite("joints", &out.joints, FRAMES * JOINT_DIM)
@@ -99,7 +100,7 @@ impl Sim {
             spare.push(buffers);
         }
         done?;
-        self.advance(people, out);
+        advance(people, &bodies, out);
         Ok(())
     }
 
@@ -126,7 +127,7 @@ impl Sim {
         Ok(())
     }
 
-    fn fill(&self, people: &People, b: &Buffers, out: &mut Primitives) {
+    fn fill(&self, people: &People, bodies: &[ShapedBody], b: &Buffers, out: &mut Primitives) {
         out.resize(people.len());
         out.frames.copy_from_slice(&people.frames);
         let parts = (
@@ -136,35 +137,33 @@ impl Sim {
             out.views.par_chunks_exact_mut(FRAMES * 3),
         );
         parts.into_par_iter().with_min_len(CHUNK).enumerate().for_each(|(i, (markers, params, joints, views))| {
-            let body = self.body.shape(&people.betas[i * BETAS..][..BETAS]);
             let (old, new) = params.split_at_mut(SEED * PARAMS);
             old.copy_from_slice(&people.params[i * SEED * PARAMS..][..SEED * PARAMS]);
             new.copy_from_slice(&b.regressed[i * FUTURE * PARAMS..][..FUTURE * PARAMS]);
             smooth_seam(params);
-            let moved = self.soles.as_ref().map(|soles| plant(soles, &body, &mut params[(SEED - 1) * PARAMS..]));
+            let moved = self.soles.as_ref().map(|soles| plant(soles, &bodies[i], &mut params[(SEED - 1) * PARAMS..]));
             let (old, new) = markers.split_at_mut(SEED * MARKER_DIM);
             old.copy_from_slice(&people.markers[i * SEED * MARKER_DIM..][..SEED * MARKER_DIM]);
-            pose_frames(&body, params, new, joints, views);
+            pose_frames(&bodies[i], params, new, joints, views);
             blend(new, &b.predicted[i * FUTURE * MARKER_DIM..], moved.as_deref());
         });
     }
+}
 
-    fn advance(&self, people: &mut People, out: &Primitives) {
-        let parts = (
-            people.frames.par_iter_mut(),
-            people.markers.par_chunks_exact_mut(SEED * MARKER_DIM),
-            people.params.par_chunks_exact_mut(SEED * PARAMS),
-            people.joints.par_chunks_exact_mut(SEED * JOINT_DIM),
-            people.views.par_chunks_exact_mut(SEED * 3),
-        );
-        let betas = &people.betas;
-        parts.into_par_iter().with_min_len(CHUNK).enumerate().for_each(|(i, (frame, markers, params, joints, views))| {
-            let body = self.body.shape(&betas[i * BETAS..][..BETAS]);
-            let last = i * FRAMES + FUTURE;
-            let mut person = PersonMut { frame, markers, params, joints, views };
-            person.reseed(&body, &out.params[last * PARAMS..][..SEED * PARAMS], &out.markers[last * MARKER_DIM..][..SEED * MARKER_DIM]);
-        });
-    }
+/// The last two frames become everybody's next seed.
+fn advance(people: &mut People, bodies: &[ShapedBody], out: &Primitives) {
+    let parts = (
+        people.frames.par_iter_mut(),
+        people.markers.par_chunks_exact_mut(SEED * MARKER_DIM),
+        people.params.par_chunks_exact_mut(SEED * PARAMS),
+        people.joints.par_chunks_exact_mut(SEED * JOINT_DIM),
+        people.views.par_chunks_exact_mut(SEED * 3),
+    );
+    parts.into_par_iter().with_min_len(CHUNK).enumerate().for_each(|(i, (frame, markers, params, joints, views))| {
+        let last = i * FRAMES + FUTURE;
+        let mut person = PersonMut { frame, markers, params, joints, views };
+        person.reseed(&bodies[i], &out.params[last * PARAMS..][..SEED * PARAMS], &out.markers[last * MARKER_DIM..][..SEED * MARKER_DIM]);
+    });
 }
 
 /// Joints and views of all 20 frames, skinned markers of the 18 new ones.

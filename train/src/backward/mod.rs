@@ -12,7 +12,7 @@ pub use head::Head;
 use rayon::prelude::*;
 
 /// Outputs of a layer whose weights one thread works on at a time.
-const OUTPUTS: usize = 192;
+const OUTPUTS: usize = 384;
 /// Products smaller than this, multiplications, are not worth a second thread.
 const SMALL: usize = 1 << 21;
 

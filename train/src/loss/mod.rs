@@ -112,7 +112,9 @@ impl Batch {
     pub(crate) fn gather(rollout: &Rollout, targets: &Targets, chosen: &[usize]) -> Self {
         let rows = |from: &[f32]| {
             let width = from.len() / targets.returns.len();
-            chosen.iter().flat_map(|&k| from[k * width..(k + 1) * width].iter().copied()).collect()
+            let mut rows = Vec::with_capacity(chosen.len() * width);
+            chosen.iter().for_each(|&k| rows.extend_from_slice(&from[k * width..(k + 1) * width]));
+            rows
         };
         Self {
             obs: rows(&rollout.obs),

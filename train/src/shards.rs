@@ -20,9 +20,9 @@ impl Shards {
         Ok(Self { pools: (0..count).map(pool).collect::<Result<_>>()?, parallel: threads > 1 })
     }
 
-    /// Every shard's part of `rows` rows.
+    /// Every shard's part of `rows` rows; fewer rows than shards leave some of them out.
     pub fn ranges(&self, rows: usize) -> impl Iterator<Item = Range<usize>> + use<> {
-        let count = self.pools.len();
+        let count = self.pools.len().min(rows);
         (0..count).map(move |i| i * rows / count..(i + 1) * rows / count)
     }
 

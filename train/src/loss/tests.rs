@@ -115,6 +115,27 @@ fn losses_and_gradients_agree_with_torch() {
     }
 }
 
+/// A row in four shards is that row in one.
+#[test]
+fn fewer_rows_than_shards() {
+    let (spec, all) = (paper(None), batch("sum", 30));
+    let params = flat(&spec, "sum.param");
+    let first = |from: &[f32]| from[..from.len() / ROWS].to_vec();
+    let one = Batch {
+        obs: first(&all.obs),
+        actions: first(&all.actions),
+        old_log_prob: first(&all.old_log_prob),
+        old_value: first(&all.old_value),
+        advantage: first(&all.advantage),
+        returns: first(&all.returns),
+    };
+    let ppo = ppo(serde_json::json!({"advantage_normalization": false}));
+    for compute in [Compute::Own, Compute::Burn(DeviceChoice::Flex.device().unwrap())] {
+        let run = |shards| gradients(&spec, &params, &compute, &Shards::new(shards, 2).unwrap(), &one, &ppo).unwrap();
+        assert_gradients(&spec, &run(4).0, &run(1).0, &format!("{compute:?}"));
+    }
+}
+
 #[test]
 fn the_penalty_on_means_agrees_with_torch() {
     let (spec, batch) = (paper(None), batch("sum", 30));

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 fn files(dir: &Path, sweep: &str) -> PathBuf {
     let point = include_str!("../train/recipes/point.toml")
         .replace(
-            "epochs = 12\nepoch_steps = 16384\nenvs = 64\ncollect_steps = 2048",
+            "epochs = 20\nepoch_steps = 16384\nenvs = 64\ncollect_steps = 2048",
             "epochs = 2\nepoch_steps = 128\nenvs = 8\ncollect_steps = 64",
         )
         .replace("batch = 512", "batch = 32")

@@ -19,8 +19,7 @@ fn a_point_learns_to_reach_its_goal() {
     succeed(&["point", "--out", out.to_str().unwrap()]);
     let (noisy, mean) = (column(&out, "test_sto/success"), column(&out, "test_det/success"));
     assert!(*noisy.last().unwrap() >= 0.95, "with noise {noisy:?}");
-    // Four seeds end between 0.86 and 0.98.
-    assert!(*mean.last().unwrap() >= 0.8, "with the mean action {mean:?}");
+    assert!(*mean.last().unwrap() >= 0.9, "with the mean action {mean:?}");
     // The first minibatch sees the policy that collected: its ratios differ from 1 by rounding only.
     assert!(column(&out, "loss/first_ratio_error").iter().all(|&e| e < 1e-4));
     assert!(*column(&out, "loss/explained_variance").last().unwrap() > 0.5);

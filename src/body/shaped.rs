@@ -162,12 +162,14 @@ impl ShapedBody {
 
     /// Skinned markers of one posed frame into `out` (201 floats): sum over bones of w (R (v - J) + x), v corrected by the pose.
     pub fn markers(&self, posed: &Posed, out: &mut [f32]) {
-        // Four lanes each, for speed.
-        let bones: Vec<(Mat3A, Vec3A)> = posed.bones().map(|(rot, pos)| (rot.into(), pos.into())).collect();
+        // Four lanes each, for speed; only bodies with fingers take memory for their bones.
+        let wide = |(rot, pos): (Mat3, Vec3)| (Mat3A::from(rot), Vec3A::from(pos));
+        let joints: [_; JOINTS] = std::array::from_fn(|k| wide(posed.bone(k)));
+        let more: Vec<_> = posed.extra.bones.iter().copied().map(wide).collect();
         let points: [Vec3; MARKERS] = std::array::from_fn(|i| {
             let lift = self.correction(i, posed).map(Vec3A::from);
             let point = self.pulls(i).iter().fold(Vec3A::ZERO, |sum, p| {
-                let (rot, pos) = bones[p.bone];
+                let (rot, pos) = p.bone.checked_sub(JOINTS).map_or_else(|| joints[p.bone], |k| more[k]);
                 let arm = lift.map_or(p.arm, |lift| p.arm + p.weight * lift);
                 sum + rot * arm + p.weight * pos
             });

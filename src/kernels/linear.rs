@@ -134,10 +134,8 @@ impl Linear {
         if rows == 0 {
             return;
         }
-        let mut panels = self.weight.chunks_exact(self.inputs);
-        for (p, bias) in self.bias.iter().enumerate() {
-            let Some(panel) = panels.next() else { break };
-            let ahead = Ahead::new(panels.clone().next().unwrap_or(&[]));
+        for (p, (panel, bias)) in self.weight.chunks_exact(self.inputs).zip(&self.bias).enumerate() {
+            let ahead = Ahead::new(self.weight.chunks_exact(self.inputs).nth(p + 1).unwrap_or(&[]));
             let (first, width) = (p * PANEL, PANEL.min(self.outputs - p * PANEL));
             let plus = if let Source::Plus(v) = source { Some((&v.data[first..], v.stride)) } else { None };
             let how = Finish { bias, plus, activation, residual: matches!(source, Source::Residual), width };

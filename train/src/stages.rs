@@ -166,7 +166,7 @@ penetration.most = 40
         let scheme = scheme(TWO, &["seed=7"]).unwrap();
         let [a, b] = [0, 1].map(|i| &scheme.parts[i].plan.recipe);
         assert_eq!((a.name.as_str(), b.name.as_str(), a.seed, b.seed), ("point-pretrain", "point-finetune", 7, 1_000_007));
-        assert_eq!((a.run.epochs, b.run.epochs, scheme.epochs()), (3, 12, 15));
+        assert_eq!((a.run.epochs, b.run.epochs, scheme.epochs()), (3, 20, 23));
         assert_eq!((a.adam.schedule, b.adam.schedule), (crate::Schedule::Constant, crate::Schedule::Linear));
         let task = |r: &Recipe| r.env_options["task"].as_table().unwrap().clone();
         assert_eq!(
@@ -190,7 +190,7 @@ penetration.most = 40
     fn stages_can_be_changed_by_name_and_by_number() {
         let epochs = |change: &str| scheme(TWO, &[change]).map(|s| s.parts.iter().map(|p| p.plan.recipe.run.epochs).collect::<Vec<_>>());
         assert_eq!(epochs("stages.finetune.run.epochs=5").unwrap(), [3, 5]);
-        assert_eq!(epochs("stages.1.run.epochs=5").unwrap(), [5, 12]);
+        assert_eq!(epochs("stages.1.run.epochs=5").unwrap(), [5, 20]);
         assert_eq!(epochs("run.epochs=5").unwrap(), [3, 5], "what a stage says counts for it");
         for (change, word) in
             [("stages.3.run.epochs=5", "pretrain, finetune"), ("stages=5", "stages"), ("stages.pretrain=5", "a key of it")]

@@ -22,7 +22,8 @@ struct Part {
     ratio_error: f64,
 }
 
-/// The minibatch's loss with gradients by hand, which are written to `grads`. `shards` are ranges of its rows, each for one thread.
+/// The minibatch's loss with gradients by hand, which are written to `grads`. `shards` are ranges of its rows: as many threads are put to use, at
+/// most, and sums depend on their number alone.
 pub(super) fn learn(
     spec: &PolicySpec,
     params: &[f32],
@@ -39,7 +40,8 @@ pub(super) fn learn(
     let blocks = shards.len().div_ceil(2);
     let rows = |k: usize| (k % blocks) * count / blocks..(k % blocks + 1) * count / blocks;
     let heads = each(parallel, (0..2 * blocks).collect(), |k: usize| {
-        let (rows, trunk) = (rows(k), trunk[rows(k).start * width..rows(k).end * width].to_vec());
+        let rows = rows(k);
+        let trunk = trunk[rows.start * width..rows.end * width].to_vec();
         if k < blocks { actor(spec, params, batch, rows, trunk, ppo) } else { critic(spec, params, batch, rows, trunk, ppo) }
     });
     let join = |parts: &[Part]| parts.iter().map(|p| &*p.d).collect::<Vec<_>>().concat();

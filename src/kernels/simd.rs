@@ -1,6 +1,6 @@
 //! Instruction-set dependent loops, chosen at run time: AVX-512, AVX2 with FMA, portable.
 //!
-//! Products of tiles and, for AVX-512, what follows them are written with intrinsics (`x86.rs`). The other element-wise loops are plain
+//! Products of tiles, transposes and, for AVX-512, what follows the tiles are written with intrinsics (`x86.rs`). The other element-wise loops are plain
 //! Rust that is inlined into a function with the right target features and vectorised there.
 
 use super::linear::Activation;
@@ -83,13 +83,35 @@ multiversion! {
 
 #[inline(always)]
 fn activate(values: &mut [f32], activation: Activation) {
+    let (blocks, rest) = values.as_chunks_mut::<16>();
+    for block in blocks {
+        *block = activated(*block, activation);
+    }
+    for v in rest {
+        [*v] = activated([*v], activation);
+    }
+}
+
+/// Loops, since what a closure does may be compiled apart, without the processor's instructions.
+#[inline(always)]
+fn activated<const N: usize>(mut x: [f32; N], activation: Activation) -> [f32; N] {
     match activation {
         Activation::None => {}
-        Activation::Tanh => values.iter_mut().for_each(|v| *v = tanh(*v)),
-        Activation::Sigmoid => values.iter_mut().for_each(|v| *v = sigmoid(*v)),
-        Activation::Relu => values.iter_mut().for_each(|v| *v = if *v < 0.0 { 0.0 } else { *v }),
-        Activation::LeakyRelu(slope) => values.iter_mut().for_each(|v| *v = if *v < 0.0 { slope * *v } else { *v }),
+        Activation::Tanh => {
+            for x in &mut x {
+                *x = tanh(*x);
+            }
+        }
+        Activation::Sigmoid => {
+            for x in &mut x {
+                *x = sigmoid(*x);
+            }
+        }
+        // Not in place: to change some of the values would become a store of some lanes, which many processors are slow at.
+        Activation::Relu => return std::array::from_fn(|i| if x[i] < 0.0 { 0.0 } else { x[i] }),
+        Activation::LeakyRelu(slope) => return std::array::from_fn(|i| if x[i] < 0.0 { slope * x[i] } else { x[i] }),
     }
+    x
 }
 
 multiversion! {
@@ -147,7 +169,7 @@ impl Ahead {
     }
 
     /// The k-th of `n` equal parts.
-    fn part(self, k: usize, n: usize) -> Self {
+    pub fn part(self, k: usize, n: usize) -> Self {
         let bytes = self.bytes / n;
         Self { start: self.start.wrapping_add(k * bytes), bytes }
     }
@@ -169,7 +191,7 @@ fn product(isa: Isa, x: &[f32], [row, input]: [usize; 2], panel: &[Lane], ahead:
         Isa::Avx512 => unsafe { x86::product_512(x.as_ptr(), [row, input], panel, ahead, out) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
-        Isa::Avx2 => unsafe { x86::product_256(x.as_ptr(), [row, input], panel, out) },
+        Isa::Avx2 => unsafe { x86::product_256(x.as_ptr(), [row, input], panel, ahead, out) },
         Isa::Portable => product_portable(x, [row, input], panel, out),
     }
 }
@@ -202,7 +224,7 @@ pub struct Finish<'a> {
 ///
 /// # Panics
 /// If `y` or the rows to add are too short.
-fn finish(isa: Isa, tile: &mut [Lane], how: &Finish, y: &mut [f32], stride: usize) {
+fn finish(isa: Isa, tile: &[Lane], how: &Finish, y: &mut [f32], stride: usize) {
     let Some(last) = tile.len().checked_sub(1) else { return };
     assert!(how.width <= PANEL && y.len() >= last * stride + how.width);
     assert!(how.plus.is_none_or(|(rows, stride)| rows.len() >= last * stride + how.width));
@@ -211,17 +233,41 @@ fn finish(isa: Isa, tile: &mut [Lane], how: &Finish, y: &mut [f32], stride: usiz
         // SAFETY: the processor has the features; the lengths were checked.
         return unsafe { x86::finish_512(tile, how, y.as_mut_ptr(), stride) };
     }
-    for (r, lane) in tile.iter_mut().enumerate() {
-        lane.0.iter_mut().zip(&how.bias.0).for_each(|(v, b)| *v += b);
+    finish_lanes(isa, tile, how, y, stride);
+}
+
+multiversion! {
+    /// [`finish`] where no intrinsics do it.
+    finish_lanes = finish_lanes_body(tile: &[Lane], how: &Finish, y: &mut [f32], stride: usize)
+}
+
+#[inline(always)]
+fn finish_lanes_body(tile: &[Lane], how: &Finish, y: &mut [f32], stride: usize) {
+    let bias = how.bias.0;
+    for (r, lane) in tile.iter().enumerate() {
+        // Values of its own, which the compiler keeps in registers.
+        let mut v: [f32; PANEL] = std::array::from_fn(|i| lane.0[i] + bias[i]);
         if let Some((rows, stride)) = how.plus {
-            lane.0.iter_mut().zip(&rows[r * stride..][..how.width]).for_each(|(v, p)| *v += p);
+            add(&mut v, &rows[r * stride..][..how.width]);
         }
-        apply(isa, &mut lane.0, how.activation);
+        v = activated(v, how.activation);
         let y = &mut y[r * stride..][..how.width];
-        match how.residual {
-            true => y.iter_mut().zip(&lane.0).for_each(|(y, v)| *y += v),
-            false => y.copy_from_slice(&lane.0[..how.width]),
+        if how.residual {
+            add(&mut v, y);
         }
+        match <&mut [f32; PANEL]>::try_from(&mut *y) {
+            Ok(whole) => *whole = v,
+            Err(_) => y.copy_from_slice(&v[..how.width]),
+        }
+    }
+}
+
+/// Adds `more`, at most a panel's values, to the first of `v`.
+#[inline(always)]
+fn add(v: &mut [f32; PANEL], more: &[f32]) {
+    match <&[f32; PANEL]>::try_from(more) {
+        Ok(whole) => *v = std::array::from_fn(|i| v[i] + whole[i]),
+        Err(_) => v.iter_mut().zip(more).for_each(|(v, m)| *v += m),
     }
 }
 
@@ -235,6 +281,11 @@ pub fn transpose(isa: Isa, rows: &[f32], stride: usize, count: usize, panel: &mu
     if isa == Isa::Avx512 {
         // SAFETY: the processor has the features; the length was checked.
         return unsafe { x86::transpose_512(rows.as_ptr(), stride, count, panel) };
+    }
+    #[cfg(target_arch = "x86_64")]
+    if isa == Isa::Avx2 && count == PANEL {
+        // SAFETY: as above.
+        return unsafe { x86::transpose_256(rows.as_ptr(), stride, panel) };
     }
     for (k, lane) in panel.iter_mut().enumerate() {
         lane.0 = std::array::from_fn(|r| if r < count { rows[r * stride + k] } else { 0.0 });

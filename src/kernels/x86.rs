@@ -11,7 +11,7 @@ pub unsafe fn product_512(x: *const f32, [row, input]: [usize; 2], panel: &[Lane
     macro_rules! rows {
         ($across:literal, $stride:expr, $($n:literal)*) => {
             // SAFETY: the caller's promise, with exactly `$n` rows.
-            match out.len() { $($n => unsafe { tile_512::<$n, $across>(x, $stride, panel, ahead, out) },)* _ => {} }
+            match out.len() { $($n => unsafe { tile_512::<$n, $across>(x, $stride, panel, 0, ahead, out) },)* _ => {} }
         };
     }
     match input {
@@ -20,52 +20,70 @@ pub unsafe fn product_512(x: *const f32, [row, input]: [usize; 2], panel: &[Lane
     }
 }
 
-/// # Safety
-/// As `product_512`; `out` has `R` rows. `stride` is that of the rows, or of the inputs if `ACROSS`; the other one is 1.
-#[target_feature(enable = "avx512f")]
-unsafe fn tile_512<const R: usize, const ACROSS: bool>(x: *const f32, stride: usize, panel: &[Lane], ahead: Ahead, out: &mut [Lane]) {
-    let (row, input) = if ACROSS { (1, stride) } else { (stride, 1) };
-    let mut sum = [[_mm512_setzero_ps(); 2]; R];
-    // Every third row, hidden from the compiler, which would work out all rows' addresses from the first one each time and run short of
-    // registers: the processor adds none, one or two rows while it loads.
-    let mut thirds: [_; 4] = std::array::from_fn(|i| std::hint::black_box(x.wrapping_add(3 * i * row)));
-    macro_rules! add {
-        ($k:expr, $lane:expr) => {
-            // SAFETY: a lane is 32 floats on a cache line; row and input are within `x`.
-            unsafe {
-                let w = [_mm512_load_ps($lane.0.as_ptr()), _mm512_load_ps($lane.0.as_ptr().add(16))];
-                for (r, sum) in sum.iter_mut().enumerate() {
-                    let v = _mm512_set1_ps(*thirds[r / 3].add(r % 3 * row + $k * input));
-                    sum[0] = _mm512_fmadd_ps(v, w[0], sum[0]);
-                    sum[1] = _mm512_fmadd_ps(v, w[1], sum[1]);
+/// Makes `$name::<R, ACROSS>(x, stride, panel, first, ahead, out)`, the tile of `R` rows and two vectors from output `first` of the panel on.
+/// `stride` is that of the rows, or of the inputs if `ACROSS`; the other one is 1.
+macro_rules! tile {
+    ($name:ident, $feature:literal, $floats:literal, $thirds:literal, $zero:ident, $load:ident, $broadcast:ident, $fmadd:ident, $store:ident) => {
+        /// # Safety
+        /// The processor has the features; `out` has `R` rows; `x` holds every input of them.
+        #[target_feature(enable = $feature)]
+        unsafe fn $name<const R: usize, const ACROSS: bool>(
+            x: *const f32,
+            stride: usize,
+            panel: &[Lane],
+            first: usize,
+            ahead: Ahead,
+            out: &mut [Lane],
+        ) {
+            let (row, input) = if ACROSS { (1, stride) } else { (stride, 1) };
+            let mut sum = [[$zero(); 2]; R];
+            // Every third row, hidden from the compiler, which would work out all rows' addresses from the first one each time and run
+            // short of registers: the processor adds none, one or two rows while it loads.
+            let mut thirds: [_; $thirds] = std::array::from_fn(|i| std::hint::black_box(x.wrapping_add(3 * i * row)));
+            macro_rules! add {
+                ($k:expr, $lane:expr) => {
+                    // SAFETY: a lane is 32 floats on a cache line; row and input are within `x`.
+                    unsafe {
+                        let w = $lane.0.as_ptr().add(first);
+                        let w = [$load(w), $load(w.add($floats))];
+                        for (r, sum) in sum.iter_mut().enumerate() {
+                            let v = $broadcast(*thirds[r / 3].add(r % 3 * row + $k * input));
+                            sum[0] = $fmadd(v, w[0], sum[0]);
+                            sum[1] = $fmadd(v, w[1], sum[1]);
+                        }
+                    }
+                };
+            }
+            let (fours, rest) = panel.as_chunks::<4>();
+            let (mut at, step) = (ahead.start, ahead.bytes / (2 * fours.len()).max(1));
+            for four in fours {
+                // Four inputs share the steps of all addresses, which would otherwise keep the multipliers waiting.
+                _mm_prefetch::<_MM_HINT_T1>(at.cast());
+                add!(0, four[0]);
+                add!(1, four[1]);
+                _mm_prefetch::<_MM_HINT_T1>(at.wrapping_add(step).cast());
+                add!(2, four[2]);
+                add!(3, four[3]);
+                at = at.wrapping_add(2 * step);
+                thirds = thirds.map(|x| x.wrapping_add(4 * input));
+            }
+            for (k, lane) in rest.iter().enumerate() {
+                add!(k, lane);
+            }
+            for (sum, out) in sum.iter().zip(out) {
+                // SAFETY: as above.
+                unsafe {
+                    let out = out.0.as_mut_ptr().add(first);
+                    $store(out, sum[0]);
+                    $store(out.add($floats), sum[1]);
                 }
             }
-        };
-    }
-    let (fours, rest) = panel.as_chunks::<4>();
-    let (mut at, step) = (ahead.start, ahead.bytes / (2 * fours.len()).max(1));
-    for four in fours {
-        // Four inputs share the arithmetic on addresses, which would otherwise keep the multipliers waiting.
-        _mm_prefetch::<_MM_HINT_T1>(at.cast());
-        add!(0, four[0]);
-        add!(1, four[1]);
-        _mm_prefetch::<_MM_HINT_T1>(at.wrapping_add(step).cast());
-        add!(2, four[2]);
-        add!(3, four[3]);
-        at = at.wrapping_add(2 * step);
-        thirds = thirds.map(|x| x.wrapping_add(4 * input));
-    }
-    for (k, lane) in rest.iter().enumerate() {
-        add!(k, lane);
-    }
-    for (sum, out) in sum.iter().zip(out) {
-        // SAFETY: as above.
-        unsafe {
-            _mm512_store_ps(out.0.as_mut_ptr(), sum[0]);
-            _mm512_store_ps(out.0.as_mut_ptr().add(16), sum[1]);
         }
-    }
+    };
 }
+
+tile!(tile_512, "avx512f", 16, 4, _mm512_setzero_ps, _mm512_load_ps, _mm512_set1_ps, _mm512_fmadd_ps, _mm512_store_ps);
+tile!(tile_256, "avx2,fma", 8, 2, _mm256_setzero_ps, _mm256_load_ps, _mm256_set1_ps, _mm256_fmadd_ps, _mm256_store_ps);
 
 /// # Safety
 /// The processor has AVX-512F; the rows of `y` and those to add, `how.width` floats each, are there.
@@ -189,44 +207,67 @@ fn transpose_16(r: [__m512; 16]) -> [__m512; 16] {
 /// # Safety
 /// The processor has AVX2 and FMA; otherwise as `product_512`.
 #[target_feature(enable = "avx2,fma")]
-pub unsafe fn product_256(x: *const f32, [row, input]: [usize; 2], panel: &[Lane], out: &mut [Lane]) {
-    // Sixteen registers: tiles of 6 rows x 16 outputs.
-    for (group, out) in out.chunks_mut(6).enumerate() {
+pub unsafe fn product_256(x: *const f32, [row, input]: [usize; 2], panel: &[Lane], ahead: Ahead, out: &mut [Lane]) {
+    // Sixteen registers: tiles of at most 6 rows x 16 outputs.
+    let groups = out.len().div_ceil(6);
+    let rows = out.len().div_ceil(groups);
+    for (group, out) in out.chunks_mut(rows).enumerate() {
         for half in 0..2 {
+            let ahead = ahead.part(2 * group + half, 2 * groups);
             macro_rules! rows {
-                ($($n:literal)*) => {
+                ($across:literal, $stride:expr, $($n:literal)*) => {
                     // SAFETY: the caller's promise, with exactly `$n` rows.
-                    match out.len() { $($n => unsafe { tile_256::<$n>(x.add(group * 6 * row), [row, input], panel, half, out) },)* _ => {} }
+                    match out.len() { $($n => unsafe { tile_256::<$n, $across>(x.add(group * rows * row), $stride, panel, 16 * half, ahead, out) },)* _ => {} }
                 };
             }
-            rows!(1 2 3 4 5 6)
+            match input {
+                1 => rows!(false, row, 1 2 3 4 5 6),
+                _ => rows!(true, input, 1 2 3 4 5 6),
+            }
         }
     }
 }
 
 /// # Safety
-/// As `product_256`; `out` has `R` rows; `half` is 0 or 1.
-#[target_feature(enable = "avx2,fma")]
-unsafe fn tile_256<const R: usize>(x: *const f32, [row, input]: [usize; 2], panel: &[Lane], half: usize, out: &mut [Lane]) {
-    let mut sum = [[_mm256_setzero_ps(); 2]; R];
-    for (k, lane) in panel.iter().enumerate() {
-        // SAFETY: a lane is 32 floats on a cache line; row and input are within `x`.
-        unsafe {
-            let w = lane.0.as_ptr().add(16 * half);
-            let w = [_mm256_load_ps(w), _mm256_load_ps(w.add(8))];
-            for (r, sum) in sum.iter_mut().enumerate() {
-                let v = _mm256_set1_ps(*x.add(r * row + k * input));
-                sum[0] = _mm256_fmadd_ps(v, w[0], sum[0]);
-                sum[1] = _mm256_fmadd_ps(v, w[1], sum[1]);
+/// The processor has AVX2; `rows` points to 8 rows of 8 floats, `stride` apart.
+#[target_feature(enable = "avx2")]
+unsafe fn columns_8(rows: *const f32, stride: usize) -> [__m256; 8] {
+    // SAFETY: the caller's promise.
+    let r: [__m256; 8] = std::array::from_fn(|r| unsafe { _mm256_loadu_ps(rows.add(r * stride)) });
+    // Within either half of a register: b[4 i + j] holds column j of the rows 4 i to 4 i + 3.
+    let mut b = r;
+    for i in 0..2 {
+        let [low, high] =
+            [0, 2].map(|k| (_mm256_unpacklo_ps(r[4 * i + k], r[4 * i + k + 1]), _mm256_unpackhi_ps(r[4 * i + k], r[4 * i + k + 1])));
+        b[4 * i] = _mm256_shuffle_ps::<0x44>(low.0, high.0);
+        b[4 * i + 1] = _mm256_shuffle_ps::<0xee>(low.0, high.0);
+        b[4 * i + 2] = _mm256_shuffle_ps::<0x44>(low.1, high.1);
+        b[4 * i + 3] = _mm256_shuffle_ps::<0xee>(low.1, high.1);
+    }
+    std::array::from_fn(|j| match j {
+        0..4 => _mm256_permute2f128_ps::<0x20>(b[j], b[4 + j]),
+        _ => _mm256_permute2f128_ps::<0x31>(b[j - 4], b[j]),
+    })
+}
+
+/// # Safety
+/// The processor has AVX2; `rows` points to 32 rows of `panel.len()` floats, `stride` apart.
+#[target_feature(enable = "avx2")]
+pub unsafe fn transpose_256(rows: *const f32, stride: usize, panel: &mut [Lane]) {
+    let (eights, rest) = panel.as_chunks_mut::<8>();
+    let whole = 8 * eights.len();
+    for (block, lanes) in eights.iter_mut().enumerate() {
+        for first in [0, 8, 16, 24] {
+            // SAFETY: eight of the rows, eight of their floats; a lane is 32 floats on a cache line.
+            unsafe {
+                for (lane, column) in lanes.iter_mut().zip(columns_8(rows.add(first * stride + 8 * block), stride)) {
+                    _mm256_store_ps(lane.0.as_mut_ptr().add(first), column);
+                }
             }
         }
     }
-    for (sum, out) in sum.iter().zip(out) {
-        // SAFETY: as above.
-        unsafe {
-            let out = out.0.as_mut_ptr().add(16 * half);
-            _mm256_store_ps(out, sum[0]);
-            _mm256_store_ps(out.add(8), sum[1]);
-        }
+    for (k, lane) in rest.iter_mut().enumerate() {
+        // SAFETY: the caller's promise.
+        lane.0 = std::array::from_fn(|r| unsafe { *rows.add(r * stride + whole + k) });
     }
 }

@@ -10,7 +10,7 @@ use egogen::agent::{ObsLayout, PolicySpec};
 use egogen::kernels::PolicyEngine;
 use egogen::motion::FUTURE;
 use egogen::sensing::{RAYS, look_all};
-use egogen::sim::{Primitives, World};
+use egogen::sim::{Primitives, Sim, World};
 use egogen_envs::motion::{MotionEnv, MotionTask};
 use egogen_envs::{StepResult, VecEnv};
 use egogen_train::recipe::{Plan, Recipe};
@@ -65,6 +65,7 @@ fn budget(name: &str) -> Outcome {
     let (envs, ppo, adam) = (recipe.run.envs, recipe.ppo, recipe.adam);
     let world = World::embedded()?;
     let task: MotionTask = recipe.env_options.get("task").map_or_else(|| Ok(MotionTask::default()), |t| t.clone().try_into())?;
+    let every = task.body_every;
     let mut env = MotionEnv::new(task, world.sim.clone(), world.train.clone(), envs, 0)?;
     let made = Registry::standard().make(&recipe.env, &recipe.env_options, envs, Purpose::Train)?;
     let spec = PolicySpec::new(recipe.policy.clone(), ObsLayout::new(made.env.spec().obs.clone()), made.env.spec().action)?;
@@ -83,9 +84,10 @@ fn budget(name: &str) -> Outcome {
     let latents = world.sim.widen(&actions, actions.len() / envs)?;
     let (model, mut moved, mut prims) = (world.sim.model().clone(), env.people().clone(), Primitives::default());
     let people = moved.clone();
-    let markers = vec![0.1; envs * FUTURE * egogen::body::MARKER_DIM];
-    let betas = people.betas.repeat(FUTURE);
-    let (mut decoded, mut bodies) = (markers.clone(), vec![0.0; envs * FUTURE * egogen::body::PARAMS]);
+    let fitted = Sim::fitted(every).len();
+    let markers = vec![0.1; envs * fitted * egogen::body::MARKER_DIM];
+    let betas = people.betas.repeat(fitted);
+    let (mut decoded, mut bodies) = (vec![0.0; envs * FUTURE * egogen::body::MARKER_DIM], vec![0.0; envs * fitted * egogen::body::PARAMS]);
     let settings: Vec<_> = (0..envs).map(|i| env.setting(i).scene.walkable.clone()).collect();
     let mut rays = vec![0.0; envs * 2 * RAYS];
     let own_shards = shards()?;
@@ -103,7 +105,7 @@ fn budget(name: &str) -> Outcome {
             "simulation",
             Box::new(|| {
                 moved.clone_from(&people);
-                Ok(world.sim.step(&mut moved, &latents, &mut prims)?)
+                Ok(world.sim.step_by(every, &mut moved, &latents, &mut prims)?)
             }),
         ),
         (

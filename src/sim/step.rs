@@ -3,12 +3,12 @@
 use super::people::{JOINT_DIM, PersonMut};
 use super::plant::plant;
 use super::{People, Primitives};
-use crate::body::{BETAS, BodyModel, MARKER_DIM, PARAMS, POSE, ShapedBody, TRANSL};
+use crate::body::{BETAS, BodyModel, HANDS, MARKER_DIM, ORIENT, PARAMS, POSE, ShapedBody, TRANSL};
 use crate::kernels::first_not_finite;
 use crate::motion::clip::Skeleton;
 use crate::motion::{FRAMES, FUTURE, MotionModel, Origin, SEED};
 use crate::{Error, Result};
-use glam::Vec2;
+use glam::{Quat, Vec2, Vec3};
 use rayon::prelude::*;
 use std::sync::{Arc, Mutex};
 
@@ -28,11 +28,11 @@ pub struct Sim {
 /// What the motion model reads and writes in one step.
 #[derive(Default)]
 struct Buffers {
-    /// n x 18 x 10.
-    betas: Vec<f32>,
     /// n x 18 x 201.
     predicted: Vec<f32>,
-    /// n x 18 x 93.
+    /// Markers (n x k x 201), betas (n x k x 10) and bodies (n x k x 93) of the k frames that get bodies from the regressor.
+    fitted: Vec<f32>,
+    betas: Vec<f32>,
     regressed: Vec<f32>,
 }
 
@@ -82,7 +82,20 @@ impl Sim {
     ///
     /// Sizes that do not fit and results that are not finite are refused (naming the person), with `people` as they were.
     pub fn step(&self, people: &mut People, latents: &[f32], out: &mut Primitives) -> Result<()> {
+        self.step_by(1, people, latents, out)
+    }
+
+    /// [`Sim::step`] at less cost: of the 18 new frames only every `every`-th one and the last two get bodies from the regressor; those of the
+    /// others are taken between them: translations, hands and quaternions linearly, the shortest way round.
+    ///
+    /// # Errors
+    /// As `step`, and if `every` is 0.
+    pub fn step_by(&self, every: usize, people: &mut People, latents: &[f32], out: &mut Primitives) -> Result<()> {
         people.check()?;
+        if every == 0 {
+            return Err(Error::invalid("bodies for every 0th frame, expected 1 or more"));
+        }
+        let fitted = Self::fitted(every);
         let (n, dim) = (people.len(), self.model.latent_dim());
         if latents.len() != n * dim {
             return Err(Error::invalid(format!("{} latent floats for {n} people, expected {n} x {dim}", latents.len())));
@@ -90,8 +103,8 @@ impl Sim {
         all_finite("latents", latents, dim)?;
         let bodies: Vec<_> = people.betas.par_chunks_exact(BETAS).with_min_len(CHUNK).map(|betas| self.body.shape(betas)).collect();
         let mut buffers = self.spare.lock().map(|mut s| s.pop().unwrap_or_default()).unwrap_or_default();
-        let done = self.predict(people, latents, &mut buffers).and_then(|()| {
-            self.fill(people, &bodies, &buffers, out);
+        let done = self.predict(&fitted, people, latents, &mut buffers).and_then(|()| {
+            self.fill(&fitted, people, &bodies, &buffers, out);
             all_finite("markers", &out.markers, FRAMES * MARKER_DIM)?;
             all_finite("bodies", &out.params, FRAMES * PARAMS)?;
             all_finite("joints", &out.joints, FRAMES * JOINT_DIM)
@@ -104,30 +117,46 @@ impl Sim {
         Ok(())
     }
 
-    fn predict(&self, people: &People, latents: &[f32], b: &mut Buffers) -> Result<()> {
-        let frames = people.len() * FUTURE;
-        b.predicted.resize(frames * MARKER_DIM, 0.0);
-        b.regressed.resize(frames * PARAMS, 0.0);
-        b.betas.clear();
-        b.betas.extend(people.betas.chunks_exact(BETAS).flat_map(|betas| std::iter::repeat_n(betas, FUTURE)).flatten());
+    /// The new frames, counted from 0, that get bodies from the regressor in [`Sim::step_by`]; `every` is at least 1.
+    pub fn fitted(every: usize) -> Vec<usize> {
+        (0..FUTURE).filter(|t| (t + 1).is_multiple_of(every) || t + SEED >= FUTURE).collect()
+    }
+
+    fn predict(&self, fitted: &[usize], people: &People, latents: &[f32], b: &mut Buffers) -> Result<()> {
+        b.predicted.resize(people.len() * FUTURE * MARKER_DIM, 0.0);
         let finite = |predicted: &[f32]| all_finite("predicted markers", predicted, FUTURE * MARKER_DIM);
         if self.model.origin() == Origin::Floor {
             self.model.decode(&people.markers, latents, &mut b.predicted)?;
             finite(&b.predicted)?;
-            return self.model.regress(&b.predicted, &b.betas, &mut b.regressed);
+            return self.regress(fitted, people, b);
         }
         // The model's frames have their origin at the pelvis of the seed's first frame instead of on the floor below it.
         let mut seed = people.markers.clone();
         shift(people, -1.0, &mut seed, SEED * MARKER_DIM, 3, 2);
         self.model.decode(&seed, latents, &mut b.predicted)?;
         finite(&b.predicted)?;
-        self.model.regress(&b.predicted, &b.betas, &mut b.regressed)?;
+        self.regress(fitted, people, b)?;
         shift(people, 1.0, &mut b.predicted, FUTURE * MARKER_DIM, 3, 2);
-        shift(people, 1.0, &mut b.regressed, FUTURE * PARAMS, PARAMS, TRANSL.start + 2);
+        shift(people, 1.0, &mut b.regressed, fitted.len() * PARAMS, PARAMS, TRANSL.start + 2);
         Ok(())
     }
 
-    fn fill(&self, people: &People, bodies: &[ShapedBody], b: &Buffers, out: &mut Primitives) {
+    /// Bodies of the predicted frames `fitted`.
+    fn regress(&self, fitted: &[usize], people: &People, b: &mut Buffers) -> Result<()> {
+        b.regressed.resize(people.len() * fitted.len() * PARAMS, 0.0);
+        b.betas.clear();
+        b.betas.extend(people.betas.chunks_exact(BETAS).flat_map(|betas| std::iter::repeat_n(betas, fitted.len())).flatten());
+        if fitted.len() == FUTURE {
+            return self.model.regress(&b.predicted, &b.betas, &mut b.regressed);
+        }
+        b.fitted.clear();
+        for person in b.predicted.chunks_exact(FUTURE * MARKER_DIM) {
+            fitted.iter().for_each(|t| b.fitted.extend(&person[t * MARKER_DIM..][..MARKER_DIM]));
+        }
+        self.model.regress(&b.fitted, &b.betas, &mut b.regressed)
+    }
+
+    fn fill(&self, fitted: &[usize], people: &People, bodies: &[ShapedBody], b: &Buffers, out: &mut Primitives) {
         out.resize(people.len());
         out.frames.copy_from_slice(&people.frames);
         let parts = (
@@ -139,7 +168,12 @@ impl Sim {
         parts.into_par_iter().with_min_len(CHUNK).enumerate().for_each(|(i, (markers, params, joints, views))| {
             let (old, new) = params.split_at_mut(SEED * PARAMS);
             old.copy_from_slice(&people.params[i * SEED * PARAMS..][..SEED * PARAMS]);
-            new.copy_from_slice(&b.regressed[i * FUTURE * PARAMS..][..FUTURE * PARAMS]);
+            let regressed = b.regressed[i * fitted.len() * PARAMS..].chunks_exact(PARAMS);
+            fitted.iter().zip(regressed).for_each(|(t, frame)| new[t * PARAMS..][..PARAMS].copy_from_slice(frame));
+            fitted.iter().fold(SEED - 1, |last, t| {
+                between(&mut params[last * PARAMS..(SEED + t + 1) * PARAMS]);
+                SEED + t
+            });
             smooth_seam(params);
             let moved = self.soles.as_ref().map(|soles| plant(soles, &bodies[i], &mut params[(SEED - 1) * PARAMS..]));
             let (old, new) = markers.split_at_mut(SEED * MARKER_DIM);
@@ -192,6 +226,21 @@ fn blend(new: &mut [f32], predicted: &[f32], moved: Option<&[Vec2]>) {
         let by = moved.map_or(Vec2::ZERO, |m| m[t]).extend(0.0).to_array();
         for (k, (m, p)) in new.iter_mut().zip(predicted).enumerate() {
             *m = 0.5 * (*m + (p + by[k % 3]));
+        }
+    }
+}
+
+/// Bodies of all frames between the first and the last one of `params`.
+fn between(params: &mut [f32]) {
+    let steps = params.len() / PARAMS - 1;
+    let (first, rest) = params.split_at_mut(PARAMS);
+    let (middle, last) = rest.split_at_mut((steps - 1) * PARAMS);
+    for (k, frame) in middle.chunks_exact_mut(PARAMS).enumerate() {
+        let share = (k + 1) as f32 / steps as f32;
+        TRANSL.chain(HANDS).for_each(|i| frame[i] = first[i] + share * (last[i] - first[i]));
+        for i in (ORIENT.start..POSE.end).step_by(3) {
+            let [a, b] = [&*first, &*last].map(|body| Quat::from_scaled_axis(Vec3::from_slice(&body[i..])));
+            a.lerp(b, share).to_scaled_axis().write_to_slice(&mut frame[i..]);
         }
     }
 }

@@ -126,13 +126,13 @@ fn placing_faces_and_stands_as_asked() {
 }
 
 /// After any number of steps frame t stands where the screw motion takes the first frame in 18 s + t goes.
-fn follows(go: Frame, steps: usize) {
+fn follows(go: Frame, steps: usize, every: usize) {
     let (mut people, body, model) = walkers(2, go);
     let start = people.clone();
     let sim = Sim::new(body, Arc::new(model));
     let mut out = Primitives::default();
     for s in 0..steps {
-        sim.step(&mut people, &[0.0; 4], &mut out).unwrap();
+        sim.step_by(every, &mut people, &[0.0; 4], &mut out).unwrap();
         for i in 0..2 {
             for t in 0..FRAMES {
                 let moved = (0..s * FUTURE + t).fold(start.frames[i], |f, _| f.compose(&go));
@@ -162,12 +162,13 @@ fn follows(go: Frame, steps: usize) {
 
 #[test]
 fn straight_walk_stays_straight() {
-    follows(Frame::planar(0.0, 0.0, 0.03), 6);
+    // Bodies between two others stand between them.
+    [1, 3, 7, FUTURE].into_iter().for_each(|every| follows(Frame::planar(0.0, 0.0, 0.03), 6, every));
 }
 
 #[test]
 fn circling_closes_the_circle() {
-    follows(Frame::planar(0.04, 0.01, 0.03), 9);
+    follows(Frame::planar(0.04, 0.01, 0.03), 9, 1);
 }
 
 #[test]
@@ -230,6 +231,7 @@ fn refuses_what_is_not_finite_or_does_not_fit() {
     assert_eq!(people, before);
     people.views.pop();
     refuse(&mut people, &[0.0; 6], "views of 3 people");
+    assert!(sim.step_by(0, &mut people.select(&[]), &[], &mut out).is_err());
     let seed = SeedMotion { params: vec![0.0; PARAMS], betas: BETA };
     assert!(people.place(0, &toy(), &seed, 0.0, 0.0, 0.0).unwrap_err().to_string().contains("expected 2 x 93"));
 }
@@ -284,4 +286,29 @@ fn the_shipped_models_active_dimensions_are_those_that_move() {
     };
     let (first, last): (f32, f32) = ((0..4).map(reach).sum(), (dim - 40..dim).map(reach).sum());
     assert!(first / 4.0 > 10.0 * last / 40.0, "{first} {last}");
+}
+
+#[test]
+fn bodies_between_by_hand() {
+    assert_eq!(Sim::fitted(1), (0..18).collect::<Vec<_>>());
+    assert_eq!(Sim::fitted(3), [2, 5, 8, 11, 14, 16, 17]);
+    assert_eq!(Sim::fitted(18), [16, 17]);
+    let mut params = vec![0.0; 4 * PARAMS];
+    let (turn, wrap, hand) = (ORIENT.start, POSE.start, HANDS.start);
+    let (first, last) = params.split_at_mut(3 * PARAMS);
+    last[TRANSL].copy_from_slice(&[0.3, -0.6, 0.9]);
+    last[hand] = 1.5;
+    last[turn + 2] = 0.3;
+    // Half a turn less 0.03 one way is near half a turn less 0.03 the other way.
+    let near = std::f32::consts::PI - 0.03;
+    (first[wrap], last[wrap]) = (near, -near);
+    between(&mut params);
+    for k in 1..3 {
+        let (frame, share) = (&params[k * PARAMS..], k as f32);
+        let close = |i: usize, want: f32| assert!((frame[i] - want).abs() < 1e-3, "entry {i} of frame {k}: {} {want}", frame[i]);
+        [0.1, -0.2, 0.3].into_iter().enumerate().for_each(|(i, v)| close(TRANSL.start + i, share * v));
+        close(hand, 0.5 * share);
+        close(turn + 2, 0.1 * share);
+        close(wrap, near + 0.02 * share);
+    }
 }

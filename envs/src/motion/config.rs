@@ -1,6 +1,7 @@
 //! What a motion task is, as data.
 
 use super::crowd::Penetration;
+use egogen::motion::FUTURE;
 use egogen::scene::{CrowdedScenes, SparseScenes};
 use egogen::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -54,6 +55,9 @@ pub struct MotionTask {
     pub pose: PoseCheck,
     /// Act through that many latents, those that move people most, and leave the others 0; absent: all of them, as published.
     pub latents: Option<usize>,
+    /// Training fits bodies to every so-many-th new frame of a primitive and to its last two, and takes those of the others between them
+    /// ([`egogen::sim::Sim::step_by`]), which saves time; 1: to all. Evaluation always fits all.
+    pub body_every: usize,
     /// Steps (of 0.45 s) after which an episode ends. The observation shows the time, so this is a termination.
     pub max_depth: u32,
     /// People start facing the goal but for a turn of up to this, degrees either way.
@@ -77,6 +81,7 @@ impl Default for MotionTask {
             weights: Weights::default(),
             pose: PoseCheck::default(),
             latents: None,
+            body_every: 1,
             max_depth: 11,
             yaw_noise_deg: 36.0,
             success_distance: 0.1,
@@ -102,6 +107,7 @@ impl MotionTask {
         need(self.pose.threshold.is_none_or(|t| t > 0.0 && t.is_finite()), "pose.threshold", "more than 0")?;
         need(self.penetration.most.is_none_or(|n| n > 0.0 && n.is_finite()), "penetration.most", "more than 0 vertices")?;
         need(self.latents != Some(0), "latents", "1 or more")?;
+        need((1..=FUTURE).contains(&self.body_every), "body_every", "1 to 18 frames")?;
         need((1..=1000).contains(&self.max_depth), "max_depth", "1 to 1000 steps")?;
         need((0.0..=180.0).contains(&self.yaw_noise_deg), "yaw_noise_deg", "0 to 180 degrees")?;
         need(self.success_distance > 0.0 && self.success_distance <= 1.0, "success_distance", "more than 0, at most 1 m")?;
@@ -128,6 +134,7 @@ mod tests {
         for (text, key) in [
             (r#"{"max_depth": 0}"#, "max_depth"),
             (r#"{"latents": 0}"#, "latents"),
+            (r#"{"body_every": 0}"#, "body_every"),
             (r#"{"rooms": {"count": 0}}"#, "rooms.count"),
             (r#"{"rooms": {"pairs": {"blocked": 2.0}}}"#, "rooms.pairs.blocked"),
             (r#"{"penetration": {"most": 0.0}}"#, "penetration.most"),

@@ -18,7 +18,7 @@ use std::borrow::Cow;
 use std::sync::Arc;
 
 /// First word of a saved state; counts up when its layout changes.
-const KIND: &str = "motion-env 3";
+const KIND: &str = "motion-env 4";
 
 /// Which episodes are played. The draws of episode k of environment i depend on the seed and on:
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -295,9 +295,10 @@ impl VecEnv for MotionEnv {
         out.prepare(&self.spec, self.num_envs());
         let held = self.stage.as_ref().map(Stage::held).unwrap_or_default();
         let standing = self.state.people.select(&held);
+        let every = if self.starts == Starts::Fresh { self.task.body_every } else { 1 };
         match self.task.latents {
-            Some(k) => self.sim.step(&mut self.state.people, &self.sim.widen(actions, k)?, &mut self.prims)?,
-            None => self.sim.step(&mut self.state.people, actions, &mut self.prims)?,
+            Some(k) => self.sim.step_by(every, &mut self.state.people, &self.sim.widen(actions, k)?, &mut self.prims)?,
+            None => self.sim.step_by(every, &mut self.state.people, actions, &mut self.prims)?,
         }
         self.state.people.put(&held, &standing);
         if let Some(stage) = &mut self.stage {

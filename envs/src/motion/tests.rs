@@ -291,14 +291,15 @@ fn who_walks_into_columns_pays_and_in_the_second_stage_ends() {
 fn training_may_fit_few_bodies_and_tests_fit_all() {
     let world = World::embedded().unwrap();
     let n = 8;
-    let walk = |make: fn(MotionTask, Arc<Sim>, Arc<SeedBank>, usize, u64) -> Result<MotionEnv, EnvError>, body_every| {
+    let walk = |training: bool, body_every| {
         let task = MotionTask { body_every, ..Default::default() };
+        let make = if training { MotionEnv::new } else { MotionEnv::evaluation };
         let mut env = make(task, world.sim.clone(), world.held_out.clone(), n, 3).unwrap();
         let mut out = StepResult::default();
         env.step(&vec![0.5; n * world.sim.model().latent_dim()], &mut out).unwrap();
         (env.primitives().markers.clone(), out.reward)
     };
-    assert_eq!(walk(MotionEnv::evaluation, 3), walk(MotionEnv::evaluation, 1));
-    let (few, all) = (walk(MotionEnv::new, 3), walk(MotionEnv::new, 1));
+    assert_eq!(walk(false, 3), walk(false, 1));
+    let (few, all) = (walk(true, 3), walk(true, 1));
     assert!(few.0 != all.0 && few.1.iter().zip(&all.1).all(|(a, b)| (a - b).abs() < 0.02), "{:?} {:?}", few.1, all.1);
 }

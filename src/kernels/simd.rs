@@ -245,7 +245,7 @@ multiversion! {
 fn finish_lanes_body(tile: &[Lane], how: &Finish, y: &mut [f32], stride: usize) {
     let bias = how.bias.0;
     for (r, lane) in tile.iter().enumerate() {
-        // Values of its own, which the compiler keeps in registers.
+        // Values of its own: to write to the tile could change bias and rows to add, for all the compiler knows.
         let mut v: [f32; PANEL] = std::array::from_fn(|i| lane.0[i] + bias[i]);
         if let Some((rows, stride)) = how.plus {
             add(&mut v, &rows[r * stride..][..how.width]);

@@ -88,22 +88,32 @@ mod tests {
     use crate::sim::{People, Primitives};
     use rand_distr::{Distribution, StandardNormal};
 
-    #[test]
-    fn people_of_the_shipped_model_stand_on_the_floor_and_stay_whole() {
+    /// 48 people on held-out seeds.
+    fn standing() -> (World, People) {
         let world = World::embedded().unwrap();
-        let n = 48;
-        let mut people = People::new(n);
-        for (i, seed) in world.held_out.seeds.iter().cycle().take(n).enumerate() {
+        let mut people = People::new(48);
+        for (i, seed) in world.held_out.seeds.iter().cycle().take(people.len()).enumerate() {
             people.place(i, world.sim.body(), seed, 0.0, 0.0, 0.0).unwrap();
         }
+        (world, people)
+    }
+
+    /// Latents of everyone's step from N(0, I).
+    fn latents(world: &World, people: &People, step: u64) -> Vec<f32> {
+        StandardNormal.sample_iter(stream(3, "walk", step)).take(people.len() * world.sim.model().latent_dim()).collect()
+    }
+
+    #[test]
+    fn people_of_the_shipped_model_stand_on_the_floor_and_stay_whole() {
+        let (world, mut people) = standing();
         let mut out = Primitives::default();
         for step in 0..11 {
-            let latents: Vec<f32> = StandardNormal.sample_iter(stream(3, "walk", step)).take(n * world.sim.model().latent_dim()).collect();
+            let latents = latents(&world, &people, step);
             world.sim.step(&mut people, &latents, &mut out).unwrap();
         }
         let body = world.sim.body().shape(&[0.0; BETAS]);
         let each = out.markers.chunks_exact(FRAMES * MARKER_DIM);
-        let mean = |of: &dyn Fn(&[f32]) -> f32| each.clone().map(of).sum::<f32>() / n as f32;
+        let mean = |of: &dyn Fn(&[f32]) -> f32| each.clone().map(of).sum::<f32>() / people.len() as f32;
         let lowest = mean(&|m| foot_heights(m).sum::<f32>() / FRAMES as f32);
         assert!((0.0..0.05).contains(&lowest), "the lowest foot marker is at {lowest} m on average");
         let contact = mean(&|m| contact_score(m));
@@ -115,15 +125,10 @@ mod tests {
     /// With bodies for every third frame people walk nearly the same way.
     #[test]
     fn few_fitted_bodies_are_enough() {
-        let world = World::embedded().unwrap();
-        let n = 48;
-        let mut people = People::new(n);
-        for (i, seed) in world.held_out.seeds.iter().cycle().take(n).enumerate() {
-            people.place(i, world.sim.body(), seed, 0.0, 0.0, 0.0).unwrap();
-        }
+        let (world, mut people) = standing();
         let (mut all, mut few) = (Primitives::default(), Primitives::default());
         for step in 0..4 {
-            let latents: Vec<f32> = StandardNormal.sample_iter(stream(3, "walk", step)).take(n * world.sim.model().latent_dim()).collect();
+            let latents = latents(&world, &people, step);
             world.sim.step_by(3, &mut people.clone(), &latents, &mut few).unwrap();
             world.sim.step(&mut people, &latents, &mut all).unwrap();
             let off: Vec<f32> = all.markers.iter().zip(&few.markers).map(|(a, b)| (a - b).abs()).collect();

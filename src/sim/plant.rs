@@ -27,13 +27,13 @@ struct Fix {
     shift: Vec2,
 }
 
-/// Changes the bodies `params` ((1 + T) x 93, z above the floor), the first of which stays, so that feet which stand do not slide;
-/// returns how far each of the T was moved in the plane (its root; the legs then differ too).
+/// Changes the bodies of the frames `which` (rising, from 0) among those behind the first one of `params` ((1 + T) x 93, z above the floor), which
+/// stays, so that feet which stand do not slide; returns how far each was moved in the plane (its root; the legs then differ too).
 ///
 /// A foot stands while its sole is low and slower than 0.6 m/s. The body moves against the slip of the foot that bears it; what slip
 /// is left to a standing foot is taken by its leg (two-bone inverse kinematics), which also keeps the foot's heading. `legs`: the
 /// soles of the mean shape.
-pub(super) fn plant(legs: &Skeleton, body: &ShapedBody, params: &mut [f32]) -> Vec<Vec2> {
+pub(super) fn plant(legs: &Skeleton, body: &ShapedBody, params: &mut [f32], which: &[usize]) -> Vec<Vec2> {
     let skeleton = Skeleton { rest: *body.joints(), legs: legs.legs };
     let (first, rest) = params.split_at_mut(PARAMS);
     let pose = pose_of(body, first);
@@ -42,7 +42,12 @@ pub(super) fn plant(legs: &Skeleton, body: &ShapedBody, params: &mut [f32]) -> V
         (foot, skeleton.sole(side, &foot))
     });
     let mut walk = Walk { skeleton, at: Vec2::ZERO, fixes: [Fix::default(); SIDES], before };
-    rest.chunks_exact_mut(PARAMS).map(|frame| walk.frame(body, frame)).collect()
+    let mut next = 0;
+    let each = which.iter().map(|&t| {
+        let steps = (t + 1 - std::mem::replace(&mut next, t + 1)) as i32;
+        walk.frame(body, &mut rest[t * PARAMS..][..PARAMS], steps)
+    });
+    each.collect()
 }
 
 struct Walk {
@@ -55,21 +60,22 @@ struct Walk {
 }
 
 impl Walk {
-    fn frame(&mut self, body: &ShapedBody, params: &mut [f32]) -> Vec2 {
+    /// The next body, `steps` frames after the one before.
+    fn frame(&mut self, body: &ShapedBody, params: &mut [f32], steps: i32) -> Vec2 {
         let mut pose = pose_of(body, params);
         let feet: [FootPose; SIDES] = std::array::from_fn(|side| self.skeleton.foot(&pose, side));
         let raw: [[Vec3; 3]; SIDES] = std::array::from_fn(|side| self.skeleton.sole(side, &feet[side]));
         let stands: [f32; SIDES] = std::array::from_fn(|side| {
             let was = self.skeleton.sole(side, &self.before[side].0);
-            standing(&was, &raw[side])
+            standing(&was, &raw[side], steps)
         });
+        let keep = stands.map(|s| (1.0 - RELEASE * (1.0 - s)).powi(steps));
         let mut slips = [Vec2::ZERO; SIDES];
         for side in 0..SIDES {
             let (foot, sole) = &mut self.before[side];
             let fix = &mut self.fixes[side];
             let turned = wrap(heading(feet[side].rot) - heading(foot.rot));
-            let keep = 1.0 - RELEASE * (1.0 - stands[side]);
-            fix.yaw = (keep * fix.yaw - stands[side] * turned).clamp(-MOST_TURN, MOST_TURN);
+            fix.yaw = (keep[side] * fix.yaw - stands[side] * turned).clamp(-MOST_TURN, MOST_TURN);
             let now = self.skeleton.sole(side, &corrected(&feet[side], fix.yaw, Vec2::ZERO));
             slips[side] = slip(sole, &now);
             (*foot, *sole) = (feet[side], now);
@@ -80,8 +86,7 @@ impl Walk {
         let step: Vec2 = (0..SIDES).map(|s| -slips[s] * stands[s] * bears[s] / total).sum();
         self.at += step;
         for (side, fix) in self.fixes.iter_mut().enumerate() {
-            let keep = 1.0 - RELEASE * (1.0 - stands[side]);
-            fix.shift = (keep * fix.shift - stands[side] * (slips[side] + step)).clamp_length_max(MOST);
+            fix.shift = (keep[side] * fix.shift - stands[side] * (slips[side] + step)).clamp_length_max(MOST);
         }
         pose.root += self.at.extend(0.0);
         params[TRANSL].copy_from_slice(&(pose.root - self.skeleton.rest[0]).to_array());
@@ -129,10 +134,10 @@ fn slip(before: &[Vec3; 3], after: &[Vec3; 3]) -> Vec2 {
     (0..3).map(|i| 0.5 * (a[i] + b[i]) * (after[i] - before[i]).truncate()).sum()
 }
 
-/// How much a foot stands, 0 to 1.
-fn standing(before: &[Vec3; 3], after: &[Vec3; 3]) -> f32 {
+/// How much a foot stands whose sole was `before` that many frames ago, 0 to 1.
+fn standing(before: &[Vec3; 3], after: &[Vec3; 3], steps: i32) -> f32 {
     let height = lowest(before).max(lowest(after));
-    let speed = slip(before, after).length() * FPS;
+    let speed = slip(before, after).length() * (FPS / steps as f32);
     let low = 1.0 - smoothstep((height - HEIGHT[0]) / (HEIGHT[1] - HEIGHT[0]));
     low * (1.0 - (speed / SPEED).powi(2)).max(0.0).powi(2)
 }
@@ -178,8 +183,12 @@ mod tests {
 
         /// The bodies as planted, and where they were moved to.
         fn planted(&self) -> (Vec<f32>, Vec<Vec2>) {
+            self.planted_at(&Vec::from_iter(0..FRAMES - 1))
+        }
+
+        fn planted_at(&self, which: &[usize]) -> (Vec<f32>, Vec<Vec2>) {
             let mut params = self.params.clone();
-            let by = plant(&self.legs, &self.body, &mut params);
+            let by = plant(&self.legs, &self.body, &mut params, which);
             (params, by)
         }
 
@@ -201,6 +210,9 @@ mod tests {
             assert!((by.x - want).abs() < 1e-5 && by.y.abs() < 1e-5, "{by} for {want}");
         }
         assert_eq!(params[..PARAMS], f.params[..PARAMS]);
+        // Where only some frames are looked at, those stand as they did.
+        let (_, some) = f.planted_at(&[0, 3, 7]);
+        some.iter().zip([by[0], by[3], by[7]]).for_each(|(a, b)| assert!((a - b).length() < 1e-5, "{a} for {b}"));
         // What is left, the legs take the same part of.
         let left = 0.0025 * (FRAMES - 1) as f32 * (1.0 - part) * (1.0 - part);
         assert!((f.way(&params, 0) - left).abs() < 1e-4, "{} for {left}", f.way(&params, 0));

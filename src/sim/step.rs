@@ -3,13 +3,14 @@
 use super::people::{JOINT_DIM, PersonMut};
 use super::plant::plant;
 use super::{People, Primitives};
-use crate::body::{BETAS, BodyModel, HANDS, MARKER_DIM, ORIENT, PARAMS, POSE, ShapedBody, TRANSL};
+use crate::body::{BETAS, BodyModel, MARKER_DIM, ORIENT, PARAMS, POSE, ShapedBody, TRANSL};
 use crate::kernels::first_not_finite;
 use crate::motion::clip::Skeleton;
 use crate::motion::{FRAMES, FUTURE, MotionModel, Origin, SEED};
 use crate::{Error, Result};
 use glam::{Quat, Vec2, Vec3};
 use rayon::prelude::*;
+use std::ops::Range;
 use std::sync::{Arc, Mutex};
 
 /// Fewest people that one task works on.
@@ -85,8 +86,10 @@ impl Sim {
         self.step_by(1, people, latents, out)
     }
 
-    /// [`Sim::step`] at less cost: of the 18 new frames only every `every`-th one and the last two get bodies from the regressor; those of the
-    /// others are taken between them: translations, hands and quaternions linearly, the shortest way round.
+    /// [`Sim::step`] at less cost: of the 18 new frames only every `every`-th one and the last two get bodies, from the regressor, planted and skinned.
+    /// In the frames between two such, quaternions lie between the bodies' the shortest way round and all else of bodies, joints and views linearly;
+    /// markers are as predicted but for what the two bodies' differ from their predictions, which is taken linearly too (at the seed's last frame it is
+    /// nothing). That smooths the seam as well: parameters there are averaged only if `every` is 1.
     ///
     /// # Errors
     /// As `step`, and if `every` is 0.
@@ -166,21 +169,83 @@ impl Sim {
             out.views.par_chunks_exact_mut(FRAMES * 3),
         );
         parts.into_par_iter().with_min_len(CHUNK).enumerate().for_each(|(i, (markers, params, joints, views))| {
-            let (old, new) = params.split_at_mut(SEED * PARAMS);
-            old.copy_from_slice(&people.params[i * SEED * PARAMS..][..SEED * PARAMS]);
+            let mut film = Film { markers, params, joints, views };
+            film.begin(people, i);
             let regressed = b.regressed[i * fitted.len() * PARAMS..].chunks_exact(PARAMS);
-            fitted.iter().zip(regressed).for_each(|(t, frame)| new[t * PARAMS..][..PARAMS].copy_from_slice(frame));
+            fitted.iter().zip(regressed).for_each(|(t, body)| film.params[(SEED + t) * PARAMS..][..PARAMS].copy_from_slice(body));
+            if fitted.len() == FUTURE {
+                smooth_seam(film.params);
+            }
+            let predicted = &b.predicted[i * FUTURE * MARKER_DIM..][..FUTURE * MARKER_DIM];
+            let moved = self.soles.as_ref().map(|soles| plant(soles, &bodies[i], &mut film.params[(SEED - 1) * PARAMS..], fitted));
+            for (k, &t) in fitted.iter().enumerate() {
+                film.pose(&bodies[i], SEED + t, &predicted[t * MARKER_DIM..], moved.as_ref().map_or(Vec2::ZERO, |m| m[k]));
+            }
             fitted.iter().fold(SEED - 1, |last, t| {
-                between(&mut params[last * PARAMS..(SEED + t + 1) * PARAMS]);
+                film.between(last..SEED + t, predicted);
                 SEED + t
             });
-            smooth_seam(params);
-            let moved = self.soles.as_ref().map(|soles| plant(soles, &bodies[i], &mut params[(SEED - 1) * PARAMS..]));
-            let (old, new) = markers.split_at_mut(SEED * MARKER_DIM);
-            old.copy_from_slice(&people.markers[i * SEED * MARKER_DIM..][..SEED * MARKER_DIM]);
-            pose_frames(&bodies[i], params, new, joints, views);
-            blend(new, &b.predicted[i * FUTURE * MARKER_DIM..], moved.as_deref());
         });
+    }
+}
+
+/// The 20 frames of one person.
+struct Film<'a> {
+    markers: &'a mut [f32],
+    params: &'a mut [f32],
+    joints: &'a mut [f32],
+    views: &'a mut [f32],
+}
+
+impl Film<'_> {
+    /// The first frames are the seed of person `i`.
+    fn begin(&mut self, people: &People, i: usize) {
+        let copy = |to: &mut [f32], from: &[f32]| {
+            let len = from.len() / people.len();
+            to[..len].copy_from_slice(&from[i * len..][..len]);
+        };
+        copy(self.markers, &people.markers);
+        copy(self.params, &people.params);
+        copy(self.joints, &people.joints);
+        copy(self.views, &people.views);
+    }
+
+    /// Joints, view and markers of the body of frame `t`: the markers half as skinned, half as `predicted`, moved in the plane as the body was.
+    fn pose(&mut self, body: &ShapedBody, t: usize, predicted: &[f32], moved: Vec2) {
+        let posed = body.pose(&self.params[t * PARAMS..][..PARAMS]);
+        posed.write_joints(&mut self.joints[t * JOINT_DIM..][..JOINT_DIM]);
+        self.views[3 * t..][..3].copy_from_slice(&posed.view().to_array());
+        let markers = &mut self.markers[t * MARKER_DIM..][..MARKER_DIM];
+        body.markers(&posed, markers);
+        let by = moved.extend(0.0).to_array();
+        for (k, (m, p)) in markers.iter_mut().zip(predicted).enumerate() {
+            *m = 0.5 * (*m + (p + by[k % 3]));
+        }
+    }
+
+    /// The frames between the first and the last one of `ends`, as [`Sim::step_by`] has them.
+    fn between(&mut self, ends: Range<usize>, predicted: &[f32]) {
+        let steps = ends.len();
+        if steps < 2 {
+            return;
+        }
+        between(&mut self.params[ends.start * PARAMS..(ends.end + 1) * PARAMS]);
+        lerp(&mut self.joints[ends.start * JOINT_DIM..(ends.end + 1) * JOINT_DIM], JOINT_DIM);
+        lerp(&mut self.views[3 * ends.start..3 * (ends.end + 1)], 3);
+        for view in self.views[3 * (ends.start + 1)..3 * ends.end].as_chunks_mut::<3>().0 {
+            *view = Vec3::from(*view).normalize().to_array();
+        }
+        let (first, rest) = self.markers[ends.start * MARKER_DIM..(ends.end + 1) * MARKER_DIM].split_at_mut(MARKER_DIM);
+        let (middle, last) = rest.split_at_mut((steps - 1) * MARKER_DIM);
+        let said = |t: usize| t.checked_sub(SEED).map_or(&*first, |t| &predicted[t * MARKER_DIM..][..MARKER_DIM]);
+        let (from, to) = (said(ends.start), said(ends.end));
+        for (k, frame) in middle.chunks_exact_mut(MARKER_DIM).enumerate() {
+            let share = (k + 1) as f32 / steps as f32;
+            let now = said(ends.start + k + 1);
+            for (i, m) in frame.iter_mut().enumerate() {
+                *m = now[i] + (1.0 - share) * (first[i] - from[i]) + share * (last[i] - to[i]);
+            }
+        }
     }
 }
 
@@ -200,18 +265,6 @@ fn advance(people: &mut People, bodies: &[ShapedBody], out: &Primitives) {
     });
 }
 
-/// Joints and views of all 20 frames, skinned markers of the 18 new ones.
-fn pose_frames(body: &ShapedBody, params: &[f32], new_markers: &mut [f32], joints: &mut [f32], views: &mut [f32]) {
-    for (t, frame) in params.chunks_exact(PARAMS).enumerate() {
-        let posed = body.pose(frame);
-        posed.write_joints(&mut joints[t * JOINT_DIM..][..JOINT_DIM]);
-        views[3 * t..][..3].copy_from_slice(&posed.view().to_array());
-        if t >= SEED {
-            body.markers(&posed, &mut new_markers[(t - SEED) * MARKER_DIM..][..MARKER_DIM]);
-        }
-    }
-}
-
 /// Adds `sign` times the height of each person's first seed pelvis to number `at` of every `stride`; `data`: n x `each`.
 fn shift(people: &People, sign: f32, data: &mut [f32], each: usize, stride: usize, at: usize) {
     for (i, data) in data.chunks_exact_mut(each).enumerate() {
@@ -220,28 +273,29 @@ fn shift(people: &People, sign: f32, data: &mut [f32], each: usize, stride: usiz
     }
 }
 
-/// Half the skinned markers `new` (18 x 201), half the predicted ones, moved in the plane as their bodies were.
-fn blend(new: &mut [f32], predicted: &[f32], moved: Option<&[Vec2]>) {
-    for (t, (new, predicted)) in new.chunks_exact_mut(MARKER_DIM).zip(predicted.chunks_exact(MARKER_DIM)).enumerate() {
-        let by = moved.map_or(Vec2::ZERO, |m| m[t]).extend(0.0).to_array();
-        for (k, (m, p)) in new.iter_mut().zip(predicted).enumerate() {
-            *m = 0.5 * (*m + (p + by[k % 3]));
+/// Bodies of all frames between the first and the last one of `params`: quaternions the shortest way round, all else linearly.
+fn between(params: &mut [f32]) {
+    let steps = params.len() / PARAMS - 1;
+    lerp(params, PARAMS);
+    let (first, rest) = params.split_at_mut(PARAMS);
+    let (middle, last) = rest.split_at_mut((steps - 1) * PARAMS);
+    for i in (ORIENT.start..POSE.end).step_by(3) {
+        let [a, b] = [&*first, &*last].map(|body| Quat::from_scaled_axis(Vec3::from_slice(&body[i..])));
+        for (k, frame) in middle.chunks_exact_mut(PARAMS).enumerate() {
+            let turn = a.lerp(b, (k + 1) as f32 / steps as f32);
+            turn.to_scaled_axis().write_to_slice(&mut frame[i..]);
         }
     }
 }
 
-/// Bodies of all frames between the first and the last one of `params`.
-fn between(params: &mut [f32]) {
-    let steps = params.len() / PARAMS - 1;
-    let (first, rest) = params.split_at_mut(PARAMS);
-    let (middle, last) = rest.split_at_mut((steps - 1) * PARAMS);
-    for (k, frame) in middle.chunks_exact_mut(PARAMS).enumerate() {
+/// Rows of `width` between the first and the last one of `data`, linearly.
+fn lerp(data: &mut [f32], width: usize) {
+    let steps = data.len() / width - 1;
+    let (first, rest) = data.split_at_mut(width);
+    let (middle, last) = rest.split_at_mut((steps - 1) * width);
+    for (k, row) in middle.chunks_exact_mut(width).enumerate() {
         let share = (k + 1) as f32 / steps as f32;
-        TRANSL.chain(HANDS).for_each(|i| frame[i] = first[i] + share * (last[i] - first[i]));
-        for i in (ORIENT.start..POSE.end).step_by(3) {
-            let [a, b] = [&*first, &*last].map(|body| Quat::from_scaled_axis(Vec3::from_slice(&body[i..])));
-            a.lerp(b, share).to_scaled_axis().write_to_slice(&mut frame[i..]);
-        }
+        row.iter_mut().zip(first.iter().zip(&*last)).for_each(|(x, (a, b))| *x = a + share * (b - a));
     }
 }
 

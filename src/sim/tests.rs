@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::body::tests::{random_params, toy};
-use crate::body::{Frame, joint};
+use crate::body::{Frame, HANDS, joint};
 use crate::sim::{SeedMotion, yaw_towards};
 use glam::{Mat3, Vec2, Vec3};
 
@@ -162,7 +162,7 @@ fn follows(go: Frame, steps: usize, every: usize) {
 
 #[test]
 fn straight_walk_stays_straight() {
-    // Bodies between two others stand between them.
+    // What lies between two bodies stands between them.
     [1, 3, 7, FUTURE].into_iter().for_each(|every| follows(Frame::planar(0.0, 0.0, 0.03), 6, every));
 }
 
@@ -286,6 +286,21 @@ fn the_shipped_models_active_dimensions_are_those_that_move() {
     };
     let (first, last): (f32, f32) = ((0..4).map(reach).sum(), (dim - 40..dim).map(reach).sum());
     assert!(first / 4.0 > 10.0 * last / 40.0, "{first} {last}");
+}
+
+/// Between the seed at 0 and the first fitted frame, whose body stands 10 cm above the prediction, markers leave the prediction bit by bit.
+#[test]
+fn markers_between_keep_to_the_prediction() {
+    let (mut people, body, mut model) = walkers(1, Frame::planar(0.0, 0.0, 0.03));
+    model.params[2] += 0.1;
+    let (start, joints) = (people.markers[2], people.joints[2]);
+    let mut out = Primitives::default();
+    Sim::new(body, Arc::new(model)).step_by(6, &mut people, &[0.0; 2], &mut out).unwrap();
+    for t in 1..FRAMES {
+        let share = ((t as f32 - 1.0) / 6.0).min(1.0);
+        let (marker, pelvis) = (out.markers[t * MARKER_DIM + 2] - start, out.joints[t * JOINT_DIM + 2] - joints);
+        assert!((marker - 0.05 * share).abs() < 1e-5 && (pelvis - 0.1 * share).abs() < 1e-5, "{t}: {marker} {pelvis}");
+    }
 }
 
 #[test]

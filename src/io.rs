@@ -236,13 +236,24 @@ pub fn pack_tensors(
     metadata: &BTreeMap<String, String>,
     precision: Precision,
 ) -> Result<Vec<u8>> {
-    let bytes = |data: &[f32]| match precision {
-        Precision::Full => data.iter().flat_map(|v| v.to_le_bytes()).collect(),
-        Precision::Half => data.iter().flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect(),
+    pack_tensors_each(tensors, metadata, |_| precision)
+}
+
+/// [`pack_tensors`] with a precision for each name.
+pub fn pack_tensors_each(
+    tensors: &[(String, Vec<usize>, Vec<f32>)],
+    metadata: &BTreeMap<String, String>,
+    precision: impl Fn(&str) -> Precision,
+) -> Result<Vec<u8>> {
+    let pack = |name: &str, data: &[f32]| match precision(name) {
+        Precision::Full => (Dtype::F32, data.iter().flat_map(|v| v.to_le_bytes()).collect()),
+        Precision::Half => (Dtype::F16, data.iter().flat_map(|&v| f16::from_f32(v).to_le_bytes()).collect()),
     };
-    let dtype = if precision == Precision::Full { Dtype::F32 } else { Dtype::F16 };
-    let raw: Vec<RawTensor> = tensors.iter().map(|(name, shape, data)| (name.as_str(), dtype, shape.clone(), bytes(data))).collect();
-    pack_raw(&raw, metadata)
+    let raw = tensors.iter().map(|(name, shape, data)| {
+        let (dtype, bytes) = pack(name, data);
+        (name.as_str(), dtype, shape.clone(), bytes)
+    });
+    pack_raw(&Vec::from_iter(raw), metadata)
 }
 
 /// Name, type, shape and little-endian elements of a tensor.

@@ -1,11 +1,12 @@
-//! The exported policy: a folder with `policy.json` and `policy.safetensors` (half precision, or single
-//! where the policy normalises observations or was brought from elsewhere).
+//! The exported policy: a folder with `policy.json` and `policy.safetensors` (half precision; single for means and standard deviations of
+//! observations, and for policies brought from elsewhere).
 //!
 //! The JSON names the observation layout, the sizes, the log-variance clamp, the hashes of what the policy stands on (motion model,
 //! body) and a golden pair: one observation and what the network says of it, computed again whenever the bundle is read.
 
+use super::spec::OBS_NORM;
 use super::{ActionSpace, Network, ObsLayout, PolicyConfig, PolicySpec};
-use crate::io::{Precision, Tensors, pack_tensors, write_atomic};
+use crate::io::{Precision, Tensors, pack_tensors_each, write_atomic};
 use crate::kernels::PolicyEngine;
 use crate::rng::stream;
 use crate::{Error, Result};
@@ -84,14 +85,12 @@ pub struct Bundle {
 }
 
 impl Bundle {
-    /// Packs a policy; its parameters are rounded to half precision, unless it normalises observations.
+    /// Packs a policy; its parameters are rounded to half precision, but for means and standard deviations of observations.
     pub fn new(spec: PolicySpec, params: &[f32], origin: BTreeMap<String, String>, trained: Trained) -> Result<Self> {
-        // Means of observations may be far larger than their standard deviations.
-        let precision = if spec.obs_norm.is_some() { Precision::Full } else { Precision::Half };
-        Self::with_precision(spec, params, origin, trained, precision)
+        Self::with_precision(spec, params, origin, trained, Precision::Half)
     }
 
-    /// Packs a policy with its parameters in that precision.
+    /// Packs a policy with what gradients have learned in that precision.
     pub fn with_precision(
         spec: PolicySpec,
         params: &[f32],
@@ -99,7 +98,9 @@ impl Bundle {
         trained: Trained,
         precision: Precision,
     ) -> Result<Self> {
-        let bytes = pack_tensors(&spec.to_tensors(params), &BTreeMap::new(), precision)?;
+        // Means of observations may be far larger than their standard deviations.
+        let precision = |name: &str| if OBS_NORM.contains(&name) { Precision::Full } else { precision };
+        let bytes = pack_tensors_each(&spec.to_tensors(params), &BTreeMap::new(), precision)?;
         let params = spec.from_tensors(&Tensors::from_bytes(WEIGHTS, bytes.clone())?)?;
         Ok(Self { spec: Arc::new(spec), params, origin, trained, bytes })
     }
@@ -242,11 +243,14 @@ mod tests {
     use super::*;
     use crate::agent::ObsGroup;
 
-    fn bundle() -> Bundle {
+    fn spec(config: &str) -> PolicySpec {
         let group = |name: &str, shape: &[usize]| ObsGroup { name: name.into(), shape: shape.into() };
         let layout = ObsLayout::new(vec![group("state", &[2, 5]), group("dist", &[1])]);
-        let config = serde_json::from_str(r#"{"gru": {"state": 6}, "octaves": 3}"#).unwrap();
-        let spec = PolicySpec::new(config, layout, 4).unwrap();
+        PolicySpec::new(serde_json::from_str(config).unwrap(), layout, 4).unwrap()
+    }
+
+    fn bundle() -> Bundle {
+        let spec = spec(r#"{"gru": {"state": 6}, "octaves": 3}"#);
         let params = spec.init(1);
         let origin = BTreeMap::from([("motion".to_string(), "m1".to_string())]);
         Bundle::new(spec, &params, origin, Trained::default()).unwrap()
@@ -271,6 +275,18 @@ mod tests {
         assert!(error.contains("policy.gru.state is 7 here, 6 in the bundle"), "{error}");
         let error = other(r#"{"gru": {"state": 6}, "octaves": 3}"#, 5);
         assert!(error.contains("action is 5 here, 4 in the bundle"), "{error}");
+    }
+
+    #[test]
+    fn how_observations_are_spread_stays_exact() {
+        let spec = spec(r#"{"gru": {"state": 6}, "octaves": 3, "obs_norm": true}"#);
+        let mut params = spec.init(1);
+        let norm = spec.obs_norm_range();
+        params[norm.start] = 2345.678;
+        let bundle = Bundle::new(spec, &params, BTreeMap::new(), Trained::default()).unwrap();
+        assert_eq!(bundle.params[norm.clone()], params[norm.clone()]);
+        assert_ne!(bundle.params[..norm.start], params[..norm.start]);
+        assert!(bundle.params.iter().zip(&params).all(|(a, b)| (a - b).abs() <= 1e-3 * b.abs().max(1e-3)));
     }
 
     #[test]

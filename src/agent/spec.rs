@@ -29,7 +29,7 @@ const SCALAR: usize = 1;
 /// Tensor name of [`PolicySpec::log_std`].
 const LOG_STD: &str = "actor.log_std";
 /// Tensor names of [`PolicySpec::obs_norm`].
-const OBS_NORM: [&str; 2] = ["obs.mean", "obs.std"];
+pub(super) const OBS_NORM: [&str; 2] = ["obs.mean", "obs.std"];
 /// Normalised observations are cut to plus and minus this.
 const OBS_MAX: f32 = 10.0;
 
@@ -183,8 +183,11 @@ impl PolicySpec {
             return Cow::Borrowed(obs);
         }
         let (mean, std) = norm.split_at(norm.len() / 2);
-        let row = |row: &'a [f32]| row.iter().zip(mean).zip(std).map(|((x, m), s)| ((x - m) / s).clamp(-OBS_MAX, OBS_MAX));
-        Cow::Owned(obs.chunks_exact(mean.len()).flat_map(row).collect())
+        let mut all = Vec::with_capacity(obs.len());
+        for row in obs.chunks_exact(mean.len()) {
+            all.extend(row.iter().zip(mean).zip(std).map(|((x, m), s)| ((x - m) / s).clamp(-OBS_MAX, OBS_MAX)));
+        }
+        Cow::Owned(all)
     }
 
     /// The clamped log variances that do not depend on the observation; empty where they do.

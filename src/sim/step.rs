@@ -309,8 +309,9 @@ fn smooth_seam(params: &mut [f32]) {
 }
 
 fn all_finite(what: &str, data: &[f32], each: usize) -> Result<()> {
-    match first_not_finite(data) {
-        Some(i) => Err(Error::invalid(format!("{what} of person {} are not finite: entry {} is {}", i / each, i % each, data[i]))),
+    let people = data.par_chunks_exact(each).with_min_len(CHUNK).enumerate();
+    match people.find_map_first(|(i, person)| first_not_finite(person).map(|k| (i, k))) {
+        Some((i, k)) => Err(Error::invalid(format!("{what} of person {i} are not finite: entry {k} is {}", data[i * each + k]))),
         None => Ok(()),
     }
 }

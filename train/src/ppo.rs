@@ -250,9 +250,10 @@ impl Learner {
                 Part::Gru { frames, width, .. } => frames * width,
                 _ => encoder.output,
             };
-            for k in encoder.start..encoder.start + width {
-                let seen = &mut self.progress.obs[k];
-                seen.add(obs[k..].iter().step_by(dim).copied());
+            let columns = encoder.start..encoder.start + width;
+            Running::add_columns(&mut self.progress.obs[columns.clone()], &obs[encoder.start..], dim);
+            for k in columns {
+                let seen = &self.progress.obs[k];
                 (mean[k], std[k]) = (seen.mean as f32, (seen.variance + f64::from(f32::EPSILON)).sqrt() as f32);
             }
         }

@@ -19,7 +19,7 @@ The best of some products of two 2048 x 2048 matrices, in PyTorch, is taken befo
 update's steps make some share of the mean of both rates.
 
 An update is `run.collect_steps` steps of `run.envs` environments and the recipe's passes over them (authors: 256 steps, for patience).
-The first one is not counted. All act through all 128 latents (the recipe `quick` through 12 of them) and fit bodies to all frames (`quick` to 7 of 18). Ratios are taken within a round, so that whatever else the machine does meets all of them.
+The first one is not counted. All act through all 128 latents (the recipe `quick` through 12 of them), fit bodies to all frames (`quick` to 7 of 18) and take observations as they come (`quick` normalises them). Ratios are taken within a round, so that whatever else the machine does meets all of them.
 """
 import argparse
 import csv
@@ -226,7 +226,7 @@ def here(train, name, updates, steps, threads):
     def run(updates):
         with tempfile.TemporaryDirectory() as folder:
             only = ["run.epoch_steps=%d" % steps, "run.epochs=%d" % updates, "test.every=9999", "test.episodes=1", "checkpoint.every=9999",
-                "env_options.task.latents=128", "env_options.task.body_every=1"]
+                "env_options.task.latents=128", "env_options.task.body_every=1", "policy.obs_norm=false"]
             command = [train, name, "--threads", str(threads), "--out", f"{folder}/run", *(x for set_ in only for x in ("--set", set_))]
             before = sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
             done = subprocess.run(command, capture_output=True, text=True)

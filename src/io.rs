@@ -240,7 +240,7 @@ pub fn pack_tensors(
 }
 
 /// [`pack_tensors`] with a precision for each name.
-pub fn pack_tensors_each(
+pub(crate) fn pack_tensors_each(
     tensors: &[(String, Vec<usize>, Vec<f32>)],
     metadata: &BTreeMap<String, String>,
     precision: impl Fn(&str) -> Precision,

@@ -87,9 +87,10 @@ impl Sim {
     }
 
     /// [`Sim::step`] at less cost: of the 18 new frames only every `every`-th one and the last two get bodies, from the regressor, planted and skinned.
-    /// In the frames between two such, quaternions lie between the bodies' the shortest way round and all else of bodies, joints and views linearly;
-    /// markers are as predicted but for what the two bodies' differ from their predictions, which is taken linearly too (at the seed's last frame it is
-    /// nothing). That smooths the seam as well: parameters there are averaged only if `every` is 1.
+    /// A frame between lies between the nearest two of them, or of the seed's last and the first of them: joints and parameters linearly, but for
+    /// rotations, which are quaternions taken linearly the shortest way round; views linearly, then made unit; markers as predicted, plus
+    /// what the two frames' markers differ from their predictions (the seed's by nothing), linearly. That smooths the seam as well: parameters
+    /// there are averaged only if `every` is 1.
     ///
     /// # Errors
     /// As `step`, and if `every` is 0.
@@ -223,7 +224,7 @@ impl Film<'_> {
         }
     }
 
-    /// The frames between the first and the last one of `ends`, as [`Sim::step_by`] has them.
+    /// The frames between `ends.start` and `ends.end`, as [`Sim::step_by`] has them.
     fn between(&mut self, ends: Range<usize>, predicted: &[f32]) {
         let steps = ends.len();
         if steps < 2 {
@@ -233,7 +234,7 @@ impl Film<'_> {
         lerp(&mut self.joints[ends.start * JOINT_DIM..(ends.end + 1) * JOINT_DIM], JOINT_DIM);
         lerp(&mut self.views[3 * ends.start..3 * (ends.end + 1)], 3);
         for view in self.views[3 * (ends.start + 1)..3 * ends.end].as_chunks_mut::<3>().0 {
-            *view = Vec3::from(*view).normalize().to_array();
+            *view = Vec3::from(*view).normalize_or_zero().to_array();
         }
         let (first, rest) = self.markers[ends.start * MARKER_DIM..(ends.end + 1) * MARKER_DIM].split_at_mut(MARKER_DIM);
         let (middle, last) = rest.split_at_mut((steps - 1) * MARKER_DIM);
@@ -309,7 +310,7 @@ fn smooth_seam(params: &mut [f32]) {
 }
 
 fn all_finite(what: &str, data: &[f32], each: usize) -> Result<()> {
-    let people = data.par_chunks_exact(each).with_min_len(CHUNK).enumerate();
+    let people = data.par_chunks_exact(each.max(1)).with_min_len(CHUNK).enumerate();
     match people.find_map_first(|(i, person)| first_not_finite(person).map(|k| (i, k))) {
         Some((i, k)) => Err(Error::invalid(format!("{what} of person {i} are not finite: entry {k} is {}", data[i * each + k]))),
         None => Ok(()),

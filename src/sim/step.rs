@@ -230,7 +230,7 @@ impl Film<'_> {
         if steps < 2 {
             return;
         }
-        between(&mut self.params[ends.start * PARAMS..(ends.end + 1) * PARAMS]);
+        bodies_between(&mut self.params[ends.start * PARAMS..(ends.end + 1) * PARAMS]);
         lerp(&mut self.joints[ends.start * JOINT_DIM..(ends.end + 1) * JOINT_DIM], JOINT_DIM);
         lerp(&mut self.views[3 * ends.start..3 * (ends.end + 1)], 3);
         for view in self.views[3 * (ends.start + 1)..3 * ends.end].as_chunks_mut::<3>().0 {
@@ -275,7 +275,7 @@ fn shift(people: &People, sign: f32, data: &mut [f32], each: usize, stride: usiz
 }
 
 /// Bodies of all frames between the first and the last one of `params`: quaternions the shortest way round, all else linearly.
-fn between(params: &mut [f32]) {
+fn bodies_between(params: &mut [f32]) {
     let steps = params.len() / PARAMS - 1;
     lerp(params, PARAMS);
     let (first, rest) = params.split_at_mut(PARAMS);

@@ -326,7 +326,7 @@ fn bodies_between_by_hand() {
     // Half a turn less 0.03 one way is near half a turn less 0.03 the other way.
     let near = std::f32::consts::PI - 0.03;
     (first[wrap], last[wrap]) = (near, -near);
-    between(&mut params);
+    bodies_between(&mut params);
     for k in 1..3 {
         let (frame, share) = (&params[k * PARAMS..], k as f32);
         let close = |i: usize, want: f32| assert!((frame[i] - want).abs() < 1e-3, "entry {i} of frame {k}: {} {want}", frame[i]);
